@@ -1,0 +1,24 @@
+"""
+Trust-region policy optimization with generalized advantage estimation for Stable-Baselines3.
+
+The paper: Schulman et al., High-Dimensional Continuous Control Using Generalized Advantage Estimation,
+arXiv 1506.02438.
+"""
+
+from sb3_gae.errors import NumericalError
+from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer, LambdaSweep
+from sb3_gae.trpo_gae import TRPOGAE
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "TRPOGAE",
+    "CnnPolicy",
+    "GAEDictRolloutBuffer",
+    "GAERolloutBuffer",
+    "LambdaSweep",
+    "MlpPolicy",
+    "MultiInputPolicy",
+    "NumericalError",
+]

@@ -1,0 +1,78 @@
+"""Refusals of bad input, in words that say what would be right."""
+
+import math
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from sb3_gae.errors import NumericalError
+
+
+def check_number(
+    name: str, value: Any, low: float = -math.inf, high: float = math.inf, *, above: bool = False, below: bool = False
+) -> None:
+    """
+    :param name: of the argument, for the message
+    :param value: what was passed
+    :param low: smallest value allowed
+    :param high: largest value allowed
+    :param above: ``low`` itself is not allowed
+    :param below: ``high`` itself is not allowed
+    :raises ValueError: if the value is not a number in that range
+    """
+    right = isinstance(value, Real) and not isinstance(value, bool)
+    if right and (low < value if above else low <= value) and (value < high if below else value <= high):
+        return
+    interval = f"{'(' if above else '['}{low:g}, {high:g}{')' if below or math.isinf(high) else ']'}"
+    raise ValueError(f"`{name}` must be a number in {interval}, got {value!r}.")
+
+
+def check_count(name: str, value: Any, low: int = 1) -> None:
+    """
+    :param name: of the argument, for the message
+    :param value: what was passed
+    :param low: smallest value allowed
+    :raises ValueError: if the value is not a whole number, or too small
+    """
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < low:
+        raise ValueError(f"`{name}` must be a whole number of at least {low}, got {value!r}.")
+
+
+def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+    """
+    :param name: of the argument, for the message
+    :param value: what was passed
+    :param choices: what is allowed
+    :raises ValueError: if the value is none of them
+    """
+    if value not in choices:
+        raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
+
+
+def check_finite_step(what: str, array: np.ndarray | dict[str, np.ndarray], step: int, first_env: int = 0) -> None:
+    """
+    :param what: the quantity, for the message
+    :param array: one entry for each environment, shape (N, ...), or a dictionary of such
+    :param step: steps since the start of the rollout, for the message
+    :param first_env: index of the environment of the first entry
+    :raises NumericalError: if any number is NaN or infinite
+    """
+    if isinstance(array, dict):
+        for key, part in array.items():
+            check_finite_step(f"{what} {key!r}", part, step, first_env)
+    elif array.dtype.kind == "f" and not np.isfinite(array).all():
+        first = int(np.argwhere(~np.isfinite(array))[0][0])
+        value = "NaN" if np.isnan(array[first]).any() else "infinity"
+        raise NumericalError(f"The {what} contains {value} at step {step} of the rollout in environment {first_env + first}.")
+
+
+def check_finite_rollout(what: str, array: np.ndarray) -> None:
+    """
+    :param what: the quantity, for the message
+    :param array: shape (T, N, ...)
+    :raises NumericalError: if any number is NaN or infinite
+    """
+    if not np.isfinite(array).all():
+        step = int(np.argwhere(~np.isfinite(array))[0][0])
+        check_finite_step(what, array[step], step)

@@ -1,0 +1,140 @@
+"""Pieces of the collection of a rollout: actions of a step, endings of a step, values of the whole."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import obs_as_tensor
+
+from sb3_gae.advantages import discounted_returns
+from sb3_gae.batch import in_chunks
+from sb3_gae.checks import check_finite_rollout, check_finite_step
+from sb3_gae.rollout_buffer import GAERolloutBuffer
+
+Observations = np.ndarray | dict[str, np.ndarray]
+
+
+class TerminalObservation(NamedTuple):
+    """
+    :param step: of the rollout, at the end of which the time limit struck
+    :param env: index of the environment
+    :param observation: the last one of the episode, without a batch axis
+    """
+
+    step: int
+    env: int
+    observation: Observations
+
+
+def sample_actions(policy: ActorCriticPolicy, observations: Observations, step: int) -> np.ndarray:
+    """
+    :param policy: in evaluation mode
+    :param observations: shape (N, ...), or a dictionary of such
+    :param step: of the rollout, for messages
+    :return: actions as the distribution gives them, shape (N, n_actions), or (N,) for Discrete
+    :raises NumericalError: if an observation or an action is not finite
+    """
+    check_finite_step("observation", observations, step)
+    with th.no_grad():
+        actions = policy._predict(obs_as_tensor(observations, policy.device)).cpu().numpy()
+    check_finite_step("action", actions, step)
+    return actions
+
+
+def environment_actions(policy: ActorCriticPolicy, actions: np.ndarray) -> np.ndarray:
+    """
+    :param policy: owner of the action space
+    :param actions: as the distribution gave them, shape (N, n_actions)
+    :return: within the bounds of the action space: scaled if the policy squashes, else clipped
+    """
+    space = policy.action_space
+    if not isinstance(space, spaces.Box):
+        return actions
+    actions = actions.reshape(-1, *space.shape)
+    return policy.unscale_action(actions) if policy.squash_output else np.clip(actions, space.low, space.high)
+
+
+def terminal_observations(step: int, dones: np.ndarray, infos: list[dict[str, Any]]) -> list[TerminalObservation]:
+    """
+    :param step: of the rollout
+    :param dones: whether each environment's episode ended, shape (N,)
+    :param infos: of the step
+    :return: those whose episode was cut by a time limit, so that what would have followed counts
+    """
+    return [
+        TerminalObservation(step, env, infos[env]["terminal_observation"])
+        for env in np.flatnonzero(dones).tolist()
+        if infos[env].get("TimeLimit.truncated", False) and infos[env].get("terminal_observation") is not None
+    ]
+
+
+def evaluate_rollout(
+    policy: ActorCriticPolicy,
+    rollout_buffer: GAERolloutBuffer,
+    terminal: list[TerminalObservation],
+    last_observations: Observations,
+) -> th.Tensor:
+    """
+    Give a full buffer its values and log-probabilities, computed for all of it at once.
+
+    :param policy: in evaluation mode, as it was when the rollout was collected
+    :param rollout_buffer: full
+    :param terminal: where time limits struck
+    :param last_observations: after the last step, shape (N, ...), or a dictionary of such
+    :return: values of the last observations, shape (N,)
+    :raises NumericalError: if a value or a log-probability is not finite
+    """
+    samples, shape = rollout_buffer.batch(), rollout_buffer.rewards.shape
+    actions = distribution_actions(policy.action_space, samples.actions)
+
+    def evaluate(observations: Any, actions: th.Tensor) -> th.Tensor:
+        values, log_probs, _ = policy.evaluate_actions(observations, actions)
+        return th.stack([values.flatten(), log_probs], dim=1)
+
+    evaluated = in_chunks(evaluate, samples.observations, actions).cpu().numpy()
+    values, log_probs = evaluated[:, 0].reshape(shape), evaluated[:, 1].reshape(shape)
+    check_finite_rollout("value", values)
+    check_finite_rollout("log-probability", log_probs)
+    rollout_buffer.set_values(values, log_probs, _bootstrap_values(policy, terminal, shape))
+    check_finite_step("observation", last_observations, len(values))
+    return _predict_values(policy, last_observations)
+
+
+def distribution_actions(action_space: spaces.Space, actions: th.Tensor) -> th.Tensor:
+    """
+    :param action_space: of the environment
+    :param actions: as the buffer keeps them, shape (B, n_actions)
+    :return: as the distribution takes them: whole numbers of shape (B,) for Discrete
+    """
+    return actions.long().flatten() if isinstance(action_space, spaces.Discrete) else actions
+
+
+def reward_returns(rollout_buffer: GAERolloutBuffer) -> np.ndarray:
+    """
+    :param rollout_buffer: full
+    :return: discounted returns of the rewards alone, no value function involved, shape (T, N)
+    """
+    nothing = np.zeros_like(rollout_buffer.rewards)
+    return discounted_returns(rollout_buffer.rewards, nothing, rollout_buffer.dones, rollout_buffer.gamma)
+
+
+def _bootstrap_values(policy: ActorCriticPolicy, terminal: list[TerminalObservation], shape: tuple[int, ...]) -> np.ndarray:
+    bootstrap_values = np.zeros(shape, dtype=np.float32)
+    if terminal:
+        for ending in terminal:
+            check_finite_step("terminal observation", _stack([ending.observation]), ending.step, ending.env)
+        steps, envs = [ending.step for ending in terminal], [ending.env for ending in terminal]
+        bootstrap_values[steps, envs] = _predict_values(policy, _stack([ending.observation for ending in terminal])).cpu()
+    return bootstrap_values
+
+
+def _predict_values(policy: ActorCriticPolicy, observations: Observations) -> th.Tensor:
+    return in_chunks(lambda part: policy.predict_values(part).flatten(), obs_as_tensor(observations, policy.device))
+
+
+def _stack(observations: list[Observations]) -> Observations:
+    if isinstance(observations[0], dict):
+        return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
+    return np.stack(observations)  # type: ignore[arg-type]

@@ -1,0 +1,93 @@
+"""Finds the MLPs inside an SB3 actor-critic policy, where there are such that :class:`DenseNetwork` can stand in for."""
+
+from collections.abc import Sequence
+
+import torch as th
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.policies import ActorCriticPolicy, BaseModel
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_gae.batch import in_chunks
+from sb3_gae.dense_network import DenseNetwork
+from sb3_gae.distributions import FISHER_METRICS
+from sb3_gae.value_head import ValueHead
+
+
+def has_dense_policy(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor]) -> bool:
+    """
+    :param policy: any actor-critic policy
+    :param parameters: what the action distribution was found to depend on
+    :return: whether that is exactly an MLP as SB3 builds it, on features that have no parameters
+    """
+    layers = _policy_layers(policy)
+    return (
+        _inherits(policy, "get_distribution", "extract_features", "_get_action_dist_from_latent")
+        and type(policy.action_dist) in FISHER_METRICS
+        and _hold_exactly(layers, policy_log_std(policy), parameters)
+    )
+
+
+def has_dense_value(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor]) -> bool:
+    """
+    :param policy: any actor-critic policy
+    :param parameters: what the value step may move
+    :return: whether that is exactly an MLP as SB3 builds it, on features that the step does not move
+    """
+    return _inherits(policy, "predict_values", "extract_features") and _hold_exactly(_value_layers(policy), [], parameters)
+
+
+def dense_policy_network(policy: ActorCriticPolicy, observations: PyTorchObs) -> DenseNetwork:
+    """
+    :param policy: one that :func:`has_dense_policy`
+    :param observations: B samples
+    :return: the network from features to means or logits
+    """
+    return DenseNetwork(_policy_layers(policy), _features(policy, observations, policy.pi_features_extractor))
+
+
+def dense_value_network(policy: ActorCriticPolicy, observations: PyTorchObs) -> DenseNetwork:
+    """
+    :param policy: one that :func:`has_dense_value`
+    :param observations: B samples
+    :return: the network from features to the value, without the factor of a :class:`ValueHead`
+    """
+    return DenseNetwork(_value_layers(policy), _features(policy, observations, policy.vf_features_extractor))
+
+
+def policy_log_std(policy: ActorCriticPolicy) -> list[th.Tensor]:
+    """
+    :param policy: any actor-critic policy
+    :return: the one parameter that a Gaussian policy has beside its layers; nothing for others
+    """
+    return [policy.log_std] if type(policy.action_dist) is DiagGaussianDistribution else []
+
+
+def _policy_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
+    return _layers(policy, "policy_net", policy.action_net)
+
+
+def _value_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
+    head = policy.value_net
+    return _layers(policy, "value_net", head.unscaled() if isinstance(head, ValueHead) else head)
+
+
+def _layers(policy: ActorCriticPolicy, body: str, head: nn.Module) -> list[nn.Module]:
+    """The layers in order; empty for an extractor that is not SB3's own."""
+    return [*getattr(policy.mlp_extractor, body), head] if type(policy.mlp_extractor) is MlpExtractor else []
+
+
+def _hold_exactly(layers: Sequence[nn.Module], others: Sequence[th.Tensor], parameters: Sequence[th.Tensor]) -> bool:
+    held = [parameter for layer in layers for parameter in layer.parameters()] + list(others)
+    return DenseNetwork.supports(layers) and {id(tensor) for tensor in held} == {id(tensor) for tensor in parameters}
+
+
+def _inherits(policy: ActorCriticPolicy, *methods: str) -> bool:
+    """Whether the class leaves these methods as SB3 wrote them."""
+    return all(getattr(type(policy), method) is getattr(ActorCriticPolicy, method) for method in methods)
+
+
+def _features(policy: ActorCriticPolicy, observations: PyTorchObs, extractor: BaseFeaturesExtractor) -> th.Tensor:
+    # ActorCriticPolicy overrides extract_features to return a pair; for one extractor it calls the base class itself
+    return in_chunks(lambda part: BaseModel.extract_features(policy, part, extractor), observations)

@@ -1,0 +1,106 @@
+"""What the trust region asks of SB3's action distributions: divergence, Fisher metric, and building them from a network."""
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.distributions import (
+    BernoulliDistribution,
+    CategoricalDistribution,
+    DiagGaussianDistribution,
+    Distribution,
+    MultiCategoricalDistribution,
+    kl_divergence,
+)
+
+OutputMetric = Callable[[th.Tensor, slice], th.Tensor]
+
+
+def snapshot(distribution: Distribution) -> Distribution:
+    """
+    SB3 policies own one distribution object and refill it at every call; this one stays as it is now.
+
+    :param distribution: computed without a graph
+    :return: a shallow copy
+    """
+    return copy.copy(distribution)
+
+
+def mean_kl(old: Distribution, new: Distribution) -> th.Tensor:
+    r"""
+    Mean over the batch of :math:`D_{KL}(\pi_{old} \| \pi_{new})`, summed over independent action dimensions.
+
+    :param old: distribution for each state of the batch
+    :param new: likewise
+    :return: a scalar, in nats
+    """
+    divergence = kl_divergence(old, new)
+    return divergence.reshape(len(divergence), -1).sum(dim=1).mean()
+
+
+def distribution_from_outputs(distribution: Distribution, outputs: th.Tensor, log_std: Sequence[th.Tensor]) -> Distribution:
+    """
+    Refill a distribution from the outputs of the last layer.
+
+    :param distribution: one of :data:`FISHER_METRICS`
+    :param outputs: means or logits, shape (B, n_out)
+    :param log_std: for a Gaussian, one tensor of shape (n_actions,); nothing for the others
+    :return: ``distribution`` itself
+    """
+    return distribution.proba_distribution(outputs, *log_std)
+
+
+def _gaussian_metric(distribution: DiagGaussianDistribution) -> OutputMetric:
+    # The standard deviation is a parameter of its own and the same in each state
+    precision = distribution.distribution.stddev[0].pow(-2)
+    return lambda tangents, rows: tangents * precision
+
+
+def _categorical_metric(distribution: CategoricalDistribution) -> OutputMetric:
+    probabilities = distribution.distribution.probs
+    return lambda tangents, rows: _softmax_metric(tangents, probabilities[rows])
+
+
+def _multi_categorical_metric(distribution: MultiCategoricalDistribution) -> OutputMetric:
+    per_action = [categorical.probs for categorical in distribution.distribution]
+    sizes = [probabilities.shape[1] for probabilities in per_action]
+
+    def metric(tangents: th.Tensor, rows: slice) -> th.Tensor:
+        parts = zip(tangents.split(sizes, dim=1), per_action, strict=True)
+        return th.cat([_softmax_metric(part, probabilities[rows]) for part, probabilities in parts], dim=1)
+
+    return metric
+
+
+def _bernoulli_metric(distribution: BernoulliDistribution) -> OutputMetric:
+    probabilities = distribution.distribution.probs
+    variance = probabilities * (1.0 - probabilities)
+    return lambda tangents, rows: tangents * variance[rows]
+
+
+def _softmax_metric(tangents: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
+    weighted = probabilities * tangents
+    return weighted - probabilities * weighted.sum(dim=1, keepdim=True)
+
+
+#: Distributions whose Fisher metric is known in closed form
+FISHER_METRICS: dict[type[Distribution], Callable[[Any], OutputMetric]] = {
+    DiagGaussianDistribution: _gaussian_metric,
+    CategoricalDistribution: _categorical_metric,
+    MultiCategoricalDistribution: _multi_categorical_metric,
+    BernoulliDistribution: _bernoulli_metric,
+}
+
+
+def fisher_metric(distribution: Distribution) -> OutputMetric:
+    r"""
+    Fisher information of a distribution in the coordinates of its last layer: :math:`M` in :math:`J^\top M J`.
+
+    Gaussian means: :math:`1/\sigma^2`. Logits of a categorical: :math:`\mathrm{diag}(p) - pp^\top`.
+    Logits of a Bernoulli: :math:`p(1-p)`.
+
+    :param distribution: one of :data:`FISHER_METRICS`, filled for the batch without a graph
+    :return: applies :math:`M` to the output tangents of a slice of the batch
+    """
+    return FISHER_METRICS[type(distribution)](distribution)

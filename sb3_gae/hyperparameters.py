@@ -1,0 +1,85 @@
+"""Arguments of :class:`~sb3_gae.TRPOGAE`: their domains, and those that belong to other algorithms."""
+
+import warnings
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from sb3_gae.checks import check_choice, check_count, check_number
+from sb3_gae.rollout_buffer import GAERolloutBuffer
+
+if TYPE_CHECKING:
+    from sb3_gae.trpo_gae import TRPOGAE
+
+_STEP_SIZE = "the sizes of the steps are set by `target_kl` and `vf_trust_region`"
+_ADAM = "or pass `vf_optimizer='adam'` to fit the value function as sb3-contrib's TRPO does"
+
+#: arguments of sb3-contrib's TRPO that only its value fit reads, and what to use instead
+ADAM_ARGUMENTS: dict[str, str] = {
+    "learning_rate": f"{_STEP_SIZE}, {_ADAM}",
+    "batch_size": f"each step uses the whole rollout; set `n_steps`, {_ADAM}",
+    "n_critic_updates": f"set `vf_steps`, {_ADAM}",
+}
+
+#: arguments of SB3's PPO and A2C, and what to use instead
+FOREIGN_ARGUMENTS: dict[str, str] = {
+    "ent_coef": "there is no entropy bonus; a larger `policy_kwargs['log_std_init']` explores more",
+    "vf_coef": "policy and value function have steps of their own; set `vf_trust_region`",
+    "max_grad_norm": _STEP_SIZE,
+    "n_epochs": "the policy takes one step a rollout; set `vf_steps` for the value function",
+    "clip_range": "set `target_kl`",
+    "clip_range_vf": "set `vf_trust_region`",
+    "use_rms_prop": _STEP_SIZE,
+    "rms_prop_eps": _STEP_SIZE,
+}
+
+
+def warn_of_unused(passed: Mapping[str, Any], advice: Mapping[str, str]) -> None:
+    """
+    :param passed: arguments that the user gave
+    :param advice: names that have no effect, and what to do instead
+    """
+    for name in passed:
+        warnings.warn(f"`{name}` has no effect here: {advice[name]}.", UserWarning, stacklevel=4)
+
+
+def check_hyperparameters(model: "TRPOGAE") -> None:
+    """
+    :param model: with its attributes set, its networks not yet built
+    :raises ValueError: if one is outside its domain
+    :raises TypeError: if the rollout buffer cannot keep what the algorithm needs
+    """
+    check_number("gamma", model.gamma, 0.0, 1.0)
+    check_number("gae_lambda", model.gae_lambda, 0.0, 1.0)
+    if model.value_lambda is not None:
+        check_number("value_lambda", model.value_lambda, 0.0, 1.0)
+    for name in ("target_kl", "vf_trust_region"):
+        check_number(name, getattr(model, name), 0.0, above=True, below=True)
+    for name in ("cg_damping", "vf_cg_damping"):
+        check_number(name, getattr(model, name), 0.0, below=True)
+    check_number("line_search_shrinking_factor", model.line_search_shrinking_factor, 0.0, 1.0, above=True, below=True)
+    for name in ("n_steps", "cg_max_steps", "vf_cg_max_steps", "line_search_max_iter", "sub_sampling_factor", "batch_size"):
+        check_count(name, getattr(model, name))
+    for name in ("vf_steps", "n_critic_updates"):
+        check_count(name, getattr(model, name), low=0)
+    if model.curvature_samples is not None:
+        check_count("curvature_samples", model.curvature_samples, low=2)
+    check_choice("vf_optimizer", model.vf_optimizer, ("trust_region", "adam"))
+    _check_batch(model)
+    _check_buffer_class(model.rollout_buffer_class)
+
+
+def _check_batch(model: "TRPOGAE") -> None:
+    n_samples = model.n_steps * model.n_envs // model.sub_sampling_factor
+    if n_samples < 2:
+        raise ValueError(
+            f"A batch needs at least 2 samples, but `n_steps` = {model.n_steps} in {model.n_envs} environment(s) with "
+            f"`sub_sampling_factor` = {model.sub_sampling_factor} gives {n_samples}; raise `n_steps`."
+        )
+
+
+def _check_buffer_class(buffer_class: type | None) -> None:
+    if buffer_class is not None and not issubclass(buffer_class, GAERolloutBuffer):
+        raise TypeError(
+            f"`rollout_buffer_class` must be a subclass of sb3_gae.GAERolloutBuffer, got {buffer_class.__name__}: "
+            "SB3's own buffers do not keep terminations and truncations apart."
+        )

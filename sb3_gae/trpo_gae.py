@@ -1,0 +1,418 @@
+"""Trust-region policy optimization with generalized advantage estimation."""
+
+import copy
+import io
+import pathlib
+from typing import Any, ClassVar, Self, cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_gae.adam_fit import adam_fit
+from sb3_gae.batch import TrainingBatch, random_subset
+from sb3_gae.checks import check_finite_rollout, check_finite_step
+from sb3_gae.collection import (
+    Observations,
+    TerminalObservation,
+    distribution_actions,
+    environment_actions,
+    evaluate_rollout,
+    reward_returns,
+    sample_actions,
+    terminal_observations,
+)
+from sb3_gae.diagnostics import explained_variance
+from sb3_gae.errors import NumericalError
+from sb3_gae.hyperparameters import ADAM_ARGUMENTS, FOREIGN_ARGUMENTS, check_hyperparameters, warn_of_unused
+from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_gae.policy_step import policy_parameters, policy_step
+from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
+from sb3_gae.saved_file import check_saved_file
+from sb3_gae.trust_region import StepRecord, TrustRegionSettings
+from sb3_gae.value_head import ValueHead
+from sb3_gae.value_step import ValueFitRecord, value_parameters, value_steps
+
+
+class TRPOGAE(OnPolicyAlgorithm):
+    r"""
+    Trust-region policy optimization with generalized advantage estimation and a trust-region value function.
+
+    Paper: https://arxiv.org/abs/1506.02438 (Schulman et al., 2016)
+
+    A drop-in for sb3-contrib's ``TRPO``: arguments of the same name mean the same, with one exception.
+    ``target_kl`` bounds the divergence summed over action dimensions, as the paper has it, where sb3-contrib
+    takes the mean over them. Each iteration computes the advantages with the value function that the rollout was
+    collected with, then steps the policy, and fits the value function last.
+
+    :param policy: ``MlpPolicy``, ``CnnPolicy``, ``MultiInputPolicy``, or a class
+    :param env: the environment to learn from (if registered in Gym, can be str)
+    :param learning_rate: of Adam; read only with ``vf_optimizer="adam"`` (default: 1e-3)
+    :param n_steps: steps of each environment in a rollout; the batch is ``n_steps * n_envs``
+    :param batch_size: of Adam's minibatches; read only with ``vf_optimizer="adam"`` (default: 128)
+    :param gamma: discount factor
+    :param cg_max_steps: largest number of conjugate-gradient steps for the policy
+    :param cg_damping: added to the diagonal of the Fisher matrix while solving for the direction
+    :param line_search_shrinking_factor: each further trial of a step is this times as long
+    :param line_search_max_iter: largest number of trials
+    :param n_critic_updates: Adam's epochs; read only with ``vf_optimizer="adam"`` (default: 10)
+    :param gae_lambda: :math:`\lambda` of the advantages: 0 trusts the value function, 1 the returns
+    :param use_sde: whether to use generalized state-dependent exploration
+    :param sde_sample_freq: sample a new noise matrix every so many steps; -1 only at the start of a rollout
+    :param rollout_buffer_class: a subclass of :class:`~sb3_gae.GAERolloutBuffer`; None to choose by the observations
+    :param rollout_buffer_kwargs: passed to the rollout buffer
+    :param normalize_advantage: whether to shift and scale the advantages of a batch to mean 0 and deviation 1
+    :param target_kl: largest mean KL divergence of a policy step, in nats
+    :param sub_sampling_factor: use every so many samples, at random, for the policy step
+    :param stats_window_size: episodes to average in the logs
+    :param tensorboard_log: directory for TensorBoard (None: no logging)
+    :param policy_kwargs: passed to the policy; :data:`~sb3_gae.policies.LOCOMOTION_NETWORKS` and
+        :data:`~sb3_gae.policies.CARTPOLE_NETWORKS` are those of the paper
+    :param verbose: 0 no output, 1 info, 2 debug
+    :param seed: for the pseudo-random generators
+    :param device: on which to run
+    :param value_lambda: :math:`\lambda` of the value targets; 1 gives the paper's Monte-Carlo returns,
+        None the same as ``gae_lambda``
+    :param vf_trust_region: largest mean of :math:`(V - V_{old})^2 / 2\sigma^2` in a value step: the paper's
+        :math:`\epsilon`, where :math:`\sigma^2` is the mean squared error before the step. No units
+    :param vf_steps: largest number of value steps a rollout
+    :param vf_cg_max_steps: largest number of conjugate-gradient steps for a value step
+    :param vf_cg_damping: added to the diagonal of the Gauss-Newton matrix over :math:`\sigma^2` while solving
+    :param vf_optimizer: ``"trust_region"``, or ``"adam"`` for the fit of sb3-contrib's TRPO
+    :param normalize_value: whether the value network's outputs are in units of a running scale of the returns
+    :param curvature_samples: largest number of samples that curvature products use, drawn at random; None for all.
+        Gradients, objectives and constraints always use every sample
+    :param foreign_arguments: arguments of PPO and A2C that have no meaning here; each warns and says what to use
+    :raises ValueError: if an argument is outside its domain
+    :raises TypeError: if an argument is unknown, or the rollout buffer is of another kind
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    rollout_buffer: GAERolloutBuffer
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule | None = None,
+        n_steps: int = 2048,
+        batch_size: int | None = None,
+        gamma: float = 0.99,
+        cg_max_steps: int = 10,
+        cg_damping: float = 0.1,
+        line_search_shrinking_factor: float = 0.8,
+        line_search_max_iter: int = 10,
+        n_critic_updates: int | None = None,
+        gae_lambda: float = 0.95,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        rollout_buffer_class: type[RolloutBuffer] | None = None,
+        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        normalize_advantage: bool = True,
+        target_kl: float = 0.01,
+        sub_sampling_factor: int = 1,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+        *,
+        value_lambda: float | None = None,
+        vf_trust_region: float = 0.2,
+        vf_steps: int = 5,
+        vf_cg_max_steps: int = 10,
+        vf_cg_damping: float = 1e-3,
+        vf_optimizer: str = "trust_region",
+        normalize_value: bool = True,
+        curvature_samples: int | None = 10_000,
+        **foreign_arguments: Any,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate=1e-3 if learning_rate is None else learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=0.0,
+            vf_coef=0.0,
+            max_grad_norm=0.0,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            rollout_buffer_class=rollout_buffer_class,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+            supported_action_spaces=(spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary),
+        )
+        adam_arguments = {"learning_rate": learning_rate, "batch_size": batch_size, "n_critic_updates": n_critic_updates}
+        self._warn_of_unused(adam_arguments, vf_optimizer, foreign_arguments)
+        self.batch_size = 128 if batch_size is None else batch_size
+        self.n_critic_updates = 10 if n_critic_updates is None else n_critic_updates
+        self.cg_max_steps = cg_max_steps
+        self.cg_damping = cg_damping
+        self.line_search_shrinking_factor = line_search_shrinking_factor
+        self.line_search_max_iter = line_search_max_iter
+        self.normalize_advantage = normalize_advantage
+        self.target_kl = target_kl
+        self.sub_sampling_factor = sub_sampling_factor
+        self.value_lambda = value_lambda
+        self.vf_trust_region = vf_trust_region
+        self.vf_steps = vf_steps
+        self.vf_cg_max_steps = vf_cg_max_steps
+        self.vf_cg_damping = vf_cg_damping
+        self.vf_optimizer = vf_optimizer
+        self.normalize_value = normalize_value
+        self.curvature_samples = curvature_samples
+        if _init_setup_model:
+            self._setup_model()
+
+    @staticmethod
+    def _warn_of_unused(adam_arguments: dict[str, Any], vf_optimizer: str, foreign_arguments: dict[str, Any]) -> None:
+        for name in foreign_arguments:
+            if name not in FOREIGN_ARGUMENTS:
+                raise TypeError(f"TRPOGAE.__init__() got an unexpected keyword argument {name!r}")
+        warn_of_unused(foreign_arguments, FOREIGN_ARGUMENTS)
+        if vf_optimizer == "trust_region":
+            passed = {name: value for name, value in adam_arguments.items() if value is not None}
+            warn_of_unused(passed, ADAM_ARGUMENTS)
+
+    def _setup_model(self) -> None:
+        check_hyperparameters(self)
+        if self.rollout_buffer_class is None:
+            is_dict = isinstance(self.observation_space, spaces.Dict)
+            self.rollout_buffer_class = GAEDictRolloutBuffer if is_dict else GAERolloutBuffer
+        super()._setup_model()
+        if not any(parameter.requires_grad for parameter in self.policy.parameters()):
+            raise ValueError("The policy has no trainable parameters; give it layers, or unfreeze them.")
+
+    def collect_rollouts(  # type: ignore[override]
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: GAERolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """
+        Fill the buffer with steps of the current policy, and compute their values and advantages.
+
+        :param env: the training environments
+        :param callback: called at each step, and at the beginning and the end
+        :param rollout_buffer: to be filled
+        :param n_rollout_steps: steps of each environment
+        :return: False if the callback ended training before the buffer was full
+        :raises NumericalError: if an observation, action, reward or value is not finite
+        """
+        assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
+        self.policy.set_training_mode(False)
+        rollout_buffer.reset()
+        terminal: list[TerminalObservation] = []
+        n_steps = 0
+        if self.use_sde:
+            self.policy.reset_noise(env.num_envs)
+        callback.on_rollout_start()
+
+        while n_steps < n_rollout_steps:
+            if self.use_sde and self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0:
+                self.policy.reset_noise(env.num_envs)
+            actions = sample_actions(self.policy, self._last_obs, n_steps)
+            clipped_actions = environment_actions(self.policy, actions)
+            new_obs, rewards, dones, infos = env.step(clipped_actions)
+            check_finite_step("reward", rewards, n_steps)
+
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+
+            self._update_info_buffer(infos, dones)
+            endings = terminal_observations(n_steps, dones, infos)
+            terminal.extend(endings)
+            truncated = np.isin(np.arange(env.num_envs), [ending.env for ending in endings])
+            rollout_buffer.add_step(self._last_obs, actions, rewards, self._last_episode_starts, dones, truncated)
+            n_steps += 1
+            self._last_obs = cast(Observations, new_obs)
+            self._last_episode_starts = dones
+
+        self._complete_rollout(rollout_buffer, terminal, self._last_obs, self._last_episode_starts)
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _complete_rollout(
+        self,
+        rollout_buffer: GAERolloutBuffer,
+        terminal: list[TerminalObservation],
+        last_obs: Observations,
+        last_dones: np.ndarray,
+    ) -> None:
+        """Values, advantages and targets of a full buffer, all with the value function of this iteration."""
+        rollout_buffer.gamma, rollout_buffer.gae_lambda = self.gamma, self.gae_lambda
+        rollout_buffer.value_lambda = self.value_lambda
+        if (head := self._value_head()) is not None:
+            head.initialize_scale(rollout_buffer.to_torch(reward_returns(rollout_buffer)))
+        last_values = evaluate_rollout(self.policy, rollout_buffer, terminal, last_obs)
+        rollout_buffer.compute_returns_and_advantage(last_values, last_dones)
+        check_finite_rollout("advantage", rollout_buffer.advantages)
+        check_finite_rollout("value target", rollout_buffer.returns)
+
+    def _value_head(self) -> ValueHead | None:
+        """The layer whose scale follows the returns, if it is to."""
+        head = getattr(self.policy, "value_net", None)
+        return head if self.normalize_value and isinstance(head, ValueHead) else None
+
+    def train(self) -> None:
+        """
+        Update policy and value function from the rollout buffer: the policy first, the value function last.
+
+        The paper's reason (section 5): a value function fitted first would overfit the batch, and take the
+        residuals and with them the policy's gradient towards zero.
+
+        :raises NumericalError: if the linear algebra of a step breaks down; the parameters of that step have not moved
+        """
+        # Evaluation mode: the line search must compare one function, and batch statistics would move at each trial
+        self.policy.set_training_mode(False)
+        self._update_learning_rate(self.policy.optimizer)
+        batch = self._training_batch()
+        of_policy = policy_parameters(self.policy, batch)
+        of_value = value_parameters(self.policy, batch, of_policy)
+        if not of_policy:
+            raise ValueError("The action distribution depends on no trainable parameter; give the policy layers.")
+        try:
+            policy_record = self._step_policy(batch, of_policy)
+            value_record = self._fit_value(batch, of_value)
+        except (th.linalg.LinAlgError, ArithmeticError) as error:
+            raise NumericalError(f"The linear algebra of the update broke down: {error}") from error
+        self._n_updates += 1
+        self._log_update(policy_record, value_record)
+
+    def _training_batch(self) -> TrainingBatch:
+        samples = self.rollout_buffer.batch()
+        actions = distribution_actions(self.action_space, samples.actions)
+        return TrainingBatch(_as_float(samples.observations), actions, samples.advantages, samples.returns)
+
+    def _step_policy(self, batch: TrainingBatch, parameters: list[th.Tensor]) -> StepRecord:
+        advantages = _standardized(batch.advantages) if self.normalize_advantage else batch.advantages
+        if self.sub_sampling_factor > 1:
+            subset = random_subset(len(batch), len(batch) // self.sub_sampling_factor, self.device)
+            batch, advantages = batch.take(subset), advantages[subset]  # type: ignore[arg-type]
+        settings = TrustRegionSettings(
+            radius=self.target_kl,
+            cg_max_steps=self.cg_max_steps,
+            cg_damping=self.cg_damping,
+            shrinking_factor=self.line_search_shrinking_factor,
+            max_trials=self.line_search_max_iter,
+        )
+        curvature_subset = random_subset(len(batch), self.curvature_samples, self.device)
+        return policy_step(self.policy, parameters, batch, advantages, settings, curvature_subset)
+
+    def _fit_value(self, batch: TrainingBatch, parameters: list[th.Tensor]) -> ValueFitRecord:
+        if (head := self._value_head()) is not None:
+            head.update_scale(batch.value_targets)
+        if self.vf_optimizer == "adam":
+            return adam_fit(self.policy, parameters, self.rollout_buffer, self.n_critic_updates, self.batch_size)
+        settings = TrustRegionSettings(
+            radius=self.vf_trust_region,
+            cg_max_steps=self.vf_cg_max_steps,
+            cg_damping=self.vf_cg_damping,
+            shrinking_factor=self.line_search_shrinking_factor,
+            max_trials=self.line_search_max_iter,
+            max_scale=1.0,
+        )
+        curvature_subset = random_subset(len(batch), self.curvature_samples, self.device)
+        return value_steps(self.policy, parameters, batch, settings, self.vf_steps, curvature_subset)
+
+    def _log_update(self, policy_record: StepRecord, value_record: ValueFitRecord) -> None:
+        targets = self.rollout_buffer.batch().returns
+        errors = value_record.values_after - targets
+        before, after = value_record.values_before.cpu().numpy(), value_record.values_after.cpu().numpy()
+        returns = targets.cpu().numpy()
+        taken = [step for step in value_record.steps if step.accepted]
+        self.logger.record("train/policy_objective", policy_record.objective_after)
+        self.logger.record("train/value_loss", errors.square().mean().item())
+        self.logger.record("train/kl_divergence_loss", policy_record.divergence)
+        self.logger.record("train/explained_variance", explained_variance(before, returns))
+        self.logger.record("train/explained_variance_after", explained_variance(after, returns))
+        self.logger.record("train/is_line_search_success", float(policy_record.accepted))
+        self.logger.record("train/line_search_trials", policy_record.trials)
+        self.logger.record("train/cg_steps", policy_record.cg_steps)
+        if value_record.steps:
+            self.logger.record("train/vf_steps", len(taken))
+            self.logger.record("train/vf_kl_divergence", max(step.divergence for step in value_record.steps))
+            self.logger.record("train/vf_cg_steps", sum(step.cg_steps for step in value_record.steps))
+        if isinstance(head := self._value_head(), ValueHead):
+            self.logger.record("train/value_scale", head.scale.item())
+        if hasattr(self.policy, "log_std"):
+            self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "TRPOGAE",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def set_parameters(
+        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        As SB3's, but all or nothing: if anything does not fit, every parameter is as it was.
+
+        :param load_path_or_dict: a saved file, or what :meth:`get_parameters` returns
+        :param exact_match: whether every parameter must be given
+        :param device: on which to load
+        """
+        before = copy.deepcopy(self.get_parameters())
+        try:
+            super().set_parameters(load_path_or_dict, exact_match, device)
+        except Exception:
+            super().set_parameters(before)  # type: ignore[arg-type]
+            raise
+
+    @classmethod
+    def load(cls, path: str | pathlib.Path | io.BufferedIOBase, env: GymEnv | None = None, *args: Any, **kwargs: Any) -> Self:
+        """
+        As SB3's, after looking whether the file is whole and one of ours.
+
+        :param path: a saved file
+        :param env: to continue training on
+        :param args: as SB3's
+        :param kwargs: as SB3's; further ones replace what was saved
+        :return: a new model
+        :raises ValueError: if the file is damaged, or was saved by another algorithm
+        """
+        check_saved_file(path)
+        return super().load(path, env, *args, **kwargs)
+
+
+def _as_float(observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor | dict[str, th.Tensor]:
+    """Floats in the policy's precision, so that not every pass over the batch converts them; integers stay."""
+    if isinstance(observations, dict):
+        return {key: _as_float(value) for key, value in observations.items()}  # type: ignore[misc]
+    return observations.float() if observations.is_floating_point() else observations
+
+
+def _standardized(advantages: th.Tensor) -> th.Tensor:
+    """Mean 0 and deviation 1; in double precision, so that advantages of 1e-30 and 1e30 come out alike."""
+    wide = advantages.double()
+    centred = wide - wide.mean()
+    deviation = centred.std()
+    return (centred / deviation if deviation > 0.0 else centred).to(advantages.dtype)

@@ -1,0 +1,136 @@
+r"""
+One trust-region step: direction by conjugate gradient, length by the radius, then a search that checks the truth.
+
+The policy step and the value step are both this; they differ in objective, divergence and radius.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch as th
+
+from sb3_gae.conjugate_gradient import CGResult, CGStatus, conjugate_gradient
+from sb3_gae.curvature import CurvatureProduct
+from sb3_gae.errors import NumericalError
+from sb3_gae.parameters import assign, flatten
+
+
+@dataclass(frozen=True)
+class LocalProblem:
+    """
+    What is known about an objective to be increased, at the present parameters.
+
+    :param name: for messages
+    :param parameters: what the step may move, n scalars in all
+    :param objective: its value now
+    :param gradient: of the objective, shape (n,)
+    :param curvature: product with the Hessian of the divergence from the present parameters, (n,) -> (n,)
+    :param evaluate: the objective, and the divergence from where the step began, at whatever the parameters then are
+    """
+
+    name: str
+    parameters: Sequence[th.Tensor]
+    objective: float
+    gradient: th.Tensor
+    curvature: CurvatureProduct
+    evaluate: Callable[[], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class TrustRegionSettings:
+    """
+    :param radius: largest divergence that a step may cause
+    :param cg_max_steps: largest number of curvature products for the direction
+    :param cg_damping: multiple of the identity that is added to the curvature while solving for the direction
+    :param shrinking_factor: each further trial is this times as long
+    :param max_trials: number of lengths that are tried
+    :param max_scale: longest step as a multiple of the solution of the linear system; 1 for an objective
+        whose own curvature is the metric, as in least squares, where more would pass the minimum
+    """
+
+    radius: float
+    cg_max_steps: int
+    cg_damping: float
+    shrinking_factor: float = 0.8
+    max_trials: int = 10
+    max_scale: float = math.inf
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """
+    What was done, not what was tried: after a rejected step ``divergence`` is 0 and the objective is as before.
+
+    :param accepted: whether the parameters moved; if not, they are bit for bit what they were
+    :param objective_before: at the start
+    :param objective_after: at the end
+    :param divergence: from the start to the end
+    :param trials: number of lengths tried
+    :param cg_status: how the solver ended
+    :param cg_steps: curvature products that entered the direction
+    """
+
+    accepted: bool
+    objective_before: float
+    objective_after: float
+    divergence: float
+    trials: int
+    cg_status: CGStatus
+    cg_steps: int
+
+
+def trust_region_step(problem: LocalProblem, settings: TrustRegionSettings) -> StepRecord:
+    """
+    Move the parameters to increase the objective within the radius, or leave them untouched.
+
+    :param problem: objective and divergence around the present parameters
+    :param settings: radius, solver and search
+    :return: what was done
+    :raises NumericalError: if the gradient or a curvature product is not finite; no parameter has moved then
+    """
+    solved = conjugate_gradient(
+        lambda vector: problem.curvature(vector) + settings.cg_damping * vector, problem.gradient, settings.cg_max_steps
+    )
+    if solved.status is CGStatus.NON_FINITE:
+        what = "gradient" if not th.isfinite(problem.gradient).all() else "curvature product"
+        raise NumericalError(f"The {what} of the {problem.name} contains NaN or infinity; the step was not taken.")
+    scale = min(_radius_scale(solved, settings), settings.max_scale)
+    if scale == 0.0:
+        return _rejected(problem, solved, trials=0)
+    return _line_search(problem, settings, scale * solved.solution, solved)
+
+
+def _radius_scale(solved: CGResult, settings: TrustRegionSettings) -> float:
+    r"""
+    The :math:`\alpha` with :math:`\frac12 (\alpha s)^\top H (\alpha s)` equal to the radius.
+
+    :math:`H` is without the damping: that belongs to the solver, not to the constraint.
+    """
+    curvature = float(solved.solution.dot(solved.product - settings.cg_damping * solved.solution))
+    if not curvature > 0.0:
+        return 0.0
+    return math.sqrt(2.0 * settings.radius / curvature)
+
+
+def _line_search(problem: LocalProblem, settings: TrustRegionSettings, step: th.Tensor, solved: CGResult) -> StepRecord:
+    """Try ever shorter steps until one increases the objective within the radius."""
+    origin = flatten(problem.parameters)
+    accepted = False
+    try:
+        for trial in range(settings.max_trials):
+            assign(problem.parameters, origin + settings.shrinking_factor**trial * step)
+            objective, divergence = problem.evaluate()
+            # NaN compares false and so is rejected
+            accepted = divergence <= settings.radius and objective > problem.objective
+            if accepted:
+                return StepRecord(True, problem.objective, objective, divergence, trial + 1, solved.status, solved.steps)
+    finally:
+        # Also when a trial raises or is interrupted: nobody gets to see parameters that were only tried
+        if not accepted:
+            assign(problem.parameters, origin)
+    return _rejected(problem, solved, trials=settings.max_trials)
+
+
+def _rejected(problem: LocalProblem, solved: CGResult, trials: int) -> StepRecord:
+    return StepRecord(False, problem.objective, problem.objective, 0.0, trials, solved.status, solved.steps)

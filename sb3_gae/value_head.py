@@ -1,0 +1,86 @@
+"""The last layer of a value function whose outputs keep to the scale of the returns."""
+
+from typing import Any
+
+import torch as th
+from torch import nn
+
+
+class ValueHead(nn.Linear):
+    r"""
+    A linear layer followed by a positive factor, so that the network in front works with numbers near 1.
+
+    The factor is a running root mean square of the value targets. When it changes, weights and bias change
+    inversely and the values stay as they are (as in PopArt, van Hasselt et al. 2016, without the shift).
+    The parameter names are those of :class:`torch.nn.Linear`, and its state loads with a factor of 1.
+
+    :param linear: layer to take over; its parameters become this layer's own
+    """
+
+    #: least weight of a new batch in the running mean square
+    momentum = 0.1
+
+    scale: th.Tensor
+    n_batches: th.Tensor
+
+    def __init__(self, linear: nn.Linear):
+        super().__init__(linear.in_features, linear.out_features, device="meta")
+        # The same objects: optimisers and initialisers that hold them stay right
+        self.weight = linear.weight
+        self.bias = linear.bias
+        self.register_buffer("scale", th.ones((), device=linear.weight.device))
+        self.register_buffer("n_batches", th.zeros((), dtype=th.long, device=linear.weight.device))
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        """
+        :param features: shape (B, n)
+        :return: values in units of the reward, shape (B, 1)
+        """
+        return super().forward(features) * self.scale
+
+    def unscaled(self) -> nn.Linear:
+        """
+        :return: a layer with the same parameters and without the factor
+        """
+        layer = nn.Linear(self.in_features, self.out_features, device="meta")
+        layer.weight, layer.bias = self.weight, self.bias
+        return layer
+
+    @th.no_grad()
+    def initialize_scale(self, returns: th.Tensor) -> None:
+        """
+        Set the factor once, before the first values are used, from returns that owe nothing to the network.
+
+        :param returns: any shape; all zeros leave the factor at 1
+        """
+        root_mean_square = _root_mean_square(returns)
+        if self.n_batches == 0 and root_mean_square > 0.0:
+            self.scale.fill_(root_mean_square)
+
+    @th.no_grad()
+    def update_scale(self, value_targets: th.Tensor) -> None:
+        """
+        Move the factor towards the root mean square of new targets and keep all values as they are.
+
+        :param value_targets: any shape
+        """
+        self.n_batches += 1
+        weight = max(self.momentum, 1.0 / int(self.n_batches))
+        new_scale = th.hypot(self.scale * (1.0 - weight) ** 0.5, _root_mean_square(value_targets) * weight**0.5)
+        if new_scale > 0.0:
+            ratio = self.scale / new_scale
+            self.weight.mul_(ratio)
+            if self.bias is not None:
+                self.bias.mul_(ratio)
+            self.scale.copy_(new_scale)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
+        for name in ("scale", "n_batches"):
+            state_dict.setdefault(prefix + name, th.ones_like(getattr(self, name)))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _root_mean_square(values: th.Tensor) -> th.Tensor:
+    # Divide first: squares of 1e30 overflow
+    largest = values.abs().max().clamp_min(th.finfo(values.dtype).tiny)
+    return largest * (values / largest).square().mean().sqrt()

@@ -1,0 +1,211 @@
+r"""
+The value step: the paper's trust region for the value function (section 5).
+
+With :math:`\sigma^2 = \mathrm{mean}(V_{old} - \hat V)^2`, the mean KL divergence between the Gaussians
+:math:`N(V_{old}, \sigma^2)` and :math:`N(V, \sigma^2)` is :math:`\mathrm{mean}(V - V_{old})^2 / 2\sigma^2`; it must not
+exceed the radius. All quantities here are divided by :math:`\sigma^2`: the objective, whose value at the start is
+:math:`-\frac12`, as well as the Gauss-Newton matrix. The radius then has no units.
+(The paper's own formula for the length of the step leaves :math:`\sigma^2` out of the matrix.)
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
+
+from sb3_gae.batch import TrainingBatch, in_chunks, take
+from sb3_gae.curvature import CurvatureProduct, hessian_product
+from sb3_gae.dense_policy import dense_value_network, has_dense_value
+from sb3_gae.parameters import flat_gradient, influencing_parameters
+from sb3_gae.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
+from sb3_gae.value_head import ValueHead
+
+
+def value_parameters(
+    policy: ActorCriticPolicy, batch: TrainingBatch, policy_parameters: Sequence[th.Tensor]
+) -> list[th.Tensor]:
+    """
+    :param policy: any actor-critic policy
+    :param batch: at least one sample
+    :param policy_parameters: what the action distribution depends on, which the value step must not move
+    :return: the other trainable parameters that the value depends on
+    """
+    sample = batch.take(th.zeros(1, dtype=th.long, device=batch.advantages.device))
+    found = influencing_parameters(policy.predict_values(sample.observations), policy.parameters())
+    shared = {id(parameter) for parameter in policy_parameters}
+    return [parameter for parameter in found if id(parameter) not in shared]
+
+
+@dataclass(frozen=True)
+class ValueFitRecord:
+    r"""
+    :param steps: a record for each step; their objectives are in units of each step's own :math:`\sigma^2`
+    :param values_before: values of the batch before the first step, in units of the reward, shape (B,)
+    :param values_after: values of the batch after the last step, in units of the reward, shape (B,)
+    """
+
+    steps: list[StepRecord]
+    values_before: th.Tensor
+    values_after: th.Tensor
+
+
+def value_steps(
+    policy: ActorCriticPolicy,
+    parameters: Sequence[th.Tensor],
+    batch: TrainingBatch,
+    settings: TrustRegionSettings,
+    n_steps: int,
+    curvature_subset: th.Tensor | None = None,
+) -> ValueFitRecord:
+    r"""
+    Fit the value function by up to ``n_steps`` trust-region steps, each measured from where it begins.
+
+    Each solves the paper's problem (section 5) once, with :math:`V_{old}` and :math:`\sigma^2` taken anew.
+    The first step that is rejected is the last.
+
+    :param policy: owner of the value function, in evaluation mode
+    :param parameters: see :func:`value_parameters`
+    :param batch: observations and value targets, B samples
+    :param settings: radius, solver and search
+    :param n_steps: largest number of steps
+    :param curvature_subset: samples to compute the curvature on, None for all
+    :return: what was done
+    :raises NumericalError: if a gradient or a curvature product is not finite
+    """
+    observations = batch.observations if curvature_subset is None else take(batch.observations, curvature_subset)
+    make_model = _DenseValues if has_dense_value(policy, parameters) else _AutogradValues
+    scale = value_scale(policy)
+    fit = _Fit(make_model(policy, parameters, batch.observations, observations), batch.value_targets / scale)
+    before, records = fit.values, []
+    for _ in range(n_steps):
+        if fit.variance == 0.0:
+            break
+        records.append(fit.step(settings))
+        if not records[-1].accepted:
+            break
+    return ValueFitRecord(records, before * scale, fit.values * scale)
+
+
+def value_scale(policy: ActorCriticPolicy) -> th.Tensor | float:
+    """
+    :param policy: any actor-critic policy
+    :return: the factor of its :class:`ValueHead`, 1 if it has none
+    """
+    head = getattr(policy, "value_net", None)
+    return head.scale if isinstance(head, ValueHead) else 1.0
+
+
+class _Values(Protocol):
+    """A value function over a fixed batch, in units of the value scale."""
+
+    parameters: Sequence[th.Tensor]
+
+    def values(self) -> th.Tensor:
+        """Values at the present parameters, shape (B,)."""
+
+    def vjp(self, cotangents: th.Tensor) -> th.Tensor:
+        """Jacobian's transpose at the parameters of the last :meth:`values`, times ``cotangents`` (B,), shape (n,)."""
+
+    def gauss_newton_product(self) -> CurvatureProduct:
+        """Products with the mean of the Jacobian's outer products over the curvature's samples, at the same parameters."""
+
+
+class _DenseValues:
+    """An MLP; the activations of the last :meth:`values` serve the gradient and the products of the next step."""
+
+    def __init__(
+        self,
+        policy: ActorCriticPolicy,
+        parameters: Sequence[th.Tensor],
+        observations: PyTorchObs,
+        curvature_observations: PyTorchObs,
+    ):
+        self._network = dense_value_network(policy, observations)
+        self._curvature_network = self._network
+        if curvature_observations is not observations:
+            self._curvature_network = dense_value_network(policy, curvature_observations)
+        self.parameters: Sequence[th.Tensor] = self._network.parameters
+
+    def values(self) -> th.Tensor:
+        return self._network.forward().squeeze(1)
+
+    def vjp(self, cotangents: th.Tensor) -> th.Tensor:
+        return self._network.vjp(cotangents[:, None])
+
+    def gauss_newton_product(self) -> CurvatureProduct:
+        network = self._curvature_network
+        if network is not self._network:
+            network.forward()
+        return lambda vector: network.gauss_newton_product(vector, lambda tangents, rows: tangents) / network.batch_size
+
+
+class _AutogradValues:
+    """Any value function that can be differentiated twice."""
+
+    def __init__(
+        self,
+        policy: ActorCriticPolicy,
+        parameters: Sequence[th.Tensor],
+        observations: PyTorchObs,
+        curvature_observations: PyTorchObs,
+    ):
+        self.parameters = parameters
+        self._policy = policy
+        self._observations = observations
+        self._curvature_observations = curvature_observations
+
+    def values(self) -> th.Tensor:
+        return in_chunks(self._predict, self._observations)
+
+    def vjp(self, cotangents: th.Tensor) -> th.Tensor:
+        return flat_gradient(self._predict(self._observations).dot(cotangents), self.parameters)
+
+    def gauss_newton_product(self) -> CurvatureProduct:
+        values = self._predict(self._curvature_observations)
+        return hessian_product(0.5 * (values - values.detach()).square().mean(), self.parameters)
+
+    def _predict(self, observations: PyTorchObs) -> th.Tensor:
+        return self._policy.predict_values(observations).squeeze(1) / value_scale(self._policy)
+
+
+class _Fit:
+    """Least squares to fixed targets, seen from wherever the last accepted step ended."""
+
+    def __init__(self, model: _Values, targets: th.Tensor):
+        self._model = model
+        self._targets = targets
+        self.values = model.values()
+
+    @property
+    def variance(self) -> float:
+        r""":math:`\sigma^2` of the present values, in units of the squared value scale."""
+        return (self.values - self._targets).square().mean().item()
+
+    def step(self, settings: TrustRegionSettings) -> StepRecord:
+        """One trust-region step from the present values."""
+        before = self.values
+        record = trust_region_step(self._local_problem(), settings)
+        if not record.accepted:
+            self.values = before
+        return record
+
+    def _local_problem(self) -> LocalProblem:
+        old_values, variance = self.values, self.variance
+        product = self._model.gauss_newton_product()
+
+        def evaluate() -> tuple[float, float]:
+            self.values = self._model.values()
+            divergence = 0.5 * (self.values - old_values).square().mean().item() / variance
+            return -0.5 * self.variance / variance, divergence
+
+        return LocalProblem(
+            name="value function",
+            parameters=self._model.parameters,
+            objective=-0.5,
+            gradient=self._model.vjp((self._targets - old_values) / (len(old_values) * variance)),
+            curvature=lambda vector: product(vector) / variance,
+            evaluate=evaluate,
+        )
