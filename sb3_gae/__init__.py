@@ -5,6 +5,7 @@ The paper: Schulman et al., High-Dimensional Continuous Control Using Generalize
 arXiv 1506.02438.
 """
 
+from sb3_gae.callbacks import LambdaSweepCallback
 from sb3_gae.errors import NumericalError
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer, LambdaSweep
@@ -18,6 +19,7 @@ __all__ = [
     "GAEDictRolloutBuffer",
     "GAERolloutBuffer",
     "LambdaSweep",
+    "LambdaSweepCallback",
     "MlpPolicy",
     "MultiInputPolicy",
     "NumericalError",

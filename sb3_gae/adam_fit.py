@@ -32,7 +32,7 @@ def adam_fit(
         return in_chunks(lambda part: policy.predict_values(part).flatten(), rollout_buffer.batch().observations)
 
     before = predict()
-    for _ in range(n_epochs):
+    for _ in range(n_epochs if parameters else 0):
         for samples in rollout_buffer.get(batch_size):
             errors = (policy.predict_values(samples.observations).flatten() - samples.returns) / scale
             gradients = th.autograd.grad(F.mse_loss(errors, th.zeros_like(errors)), parameters)

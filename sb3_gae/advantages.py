@@ -49,7 +49,8 @@ def td_residuals(rewards: FloatArray, values: FloatArray, next_values: FloatArra
     :param gamma: discount factor
     :return: shape (T, N)
     """
-    return rewards + gamma * next_values - values
+    # A NumPy double would turn single-precision arrays into double
+    return rewards + float(gamma) * next_values - values
 
 
 def generalized_advantages(deltas: FloatArray, dones: np.ndarray, gamma: float, gae_lambda: float) -> FloatArray:
@@ -108,7 +109,7 @@ def discounted_returns(rewards: FloatArray, next_values: FloatArray, dones: np.n
     """
     cut = dones.copy()
     cut[-1] = True
-    return _decayed_suffix_sums(rewards + gamma * next_values * cut, dones, np.asarray(gamma, dtype=rewards.dtype))
+    return _decayed_suffix_sums(rewards + float(gamma) * next_values * cut, dones, np.asarray(gamma, dtype=rewards.dtype))
 
 
 def effective_horizon(gamma: ArrayLike, gae_lambda: ArrayLike) -> FloatArray:

@@ -5,6 +5,7 @@ from numbers import Real
 from typing import Any
 
 import numpy as np
+from torch import nn
 
 from sb3_gae.errors import NumericalError
 
@@ -48,6 +49,18 @@ def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
     """
     if value not in choices:
         raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
+
+
+def check_finite_parameters(module: nn.Module) -> None:
+    """
+    :param module: any
+    :raises NumericalError: if any number in a parameter is NaN or infinite
+    """
+    for name, parameter in module.named_parameters():
+        if not parameter.isfinite().all():
+            raise NumericalError(
+                f"The policy's parameter {name!r} contains NaN or infinity; nothing can be learnt from there."
+            )
 
 
 def check_finite_step(what: str, array: np.ndarray | dict[str, np.ndarray], step: int, first_env: int = 0) -> None:

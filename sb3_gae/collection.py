@@ -11,6 +11,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from sb3_gae.advantages import discounted_returns
 from sb3_gae.batch import in_chunks
 from sb3_gae.checks import check_finite_rollout, check_finite_step
+from sb3_gae.errors import NumericalError
 from sb3_gae.rollout_buffer import GAERolloutBuffer
 
 Observations = np.ndarray | dict[str, np.ndarray]
@@ -31,14 +32,18 @@ class TerminalObservation(NamedTuple):
 def sample_actions(policy: ActorCriticPolicy, observations: Observations, step: int) -> np.ndarray:
     """
     :param policy: in evaluation mode
-    :param observations: shape (N, ...), or a dictionary of such
+    :param observations: finite, shape (N, ...), or a dictionary of such
     :param step: of the rollout, for messages
-    :return: actions as the distribution gives them, shape (N, n_actions), or (N,) for Discrete
-    :raises NumericalError: if an observation or an action is not finite
+    :return: actions as the distribution gives them, in the shape of the action space, (N, ...)
+    :raises NumericalError: if an action, or a parameter of the distribution, is not finite
     """
-    check_finite_step("observation", observations, step)
-    with th.no_grad():
-        actions = policy._predict(obs_as_tensor(observations, policy.device)).cpu().numpy()
+    try:
+        with th.no_grad():
+            actions = policy._predict(obs_as_tensor(observations, policy.device)).cpu().numpy()
+        actions = actions.reshape(-1, *policy.action_space.shape)  # type: ignore[misc]
+    except ValueError as error:
+        # So torch refuses the parameters of a distribution
+        raise NumericalError(f"The action distribution is invalid at step {step} of the rollout: {error}") from error
     check_finite_step("action", actions, step)
     return actions
 
@@ -46,13 +51,12 @@ def sample_actions(policy: ActorCriticPolicy, observations: Observations, step: 
 def environment_actions(policy: ActorCriticPolicy, actions: np.ndarray) -> np.ndarray:
     """
     :param policy: owner of the action space
-    :param actions: as the distribution gave them, shape (N, n_actions)
+    :param actions: as the distribution gave them, in the shape of the action space, (N, ...)
     :return: within the bounds of the action space: scaled if the policy squashes, else clipped
     """
     space = policy.action_space
     if not isinstance(space, spaces.Box):
         return actions
-    actions = actions.reshape(-1, *space.shape)
     return policy.unscale_action(actions) if policy.squash_output else np.clip(actions, space.low, space.high)
 
 
@@ -62,12 +66,16 @@ def terminal_observations(step: int, dones: np.ndarray, infos: list[dict[str, An
     :param dones: whether each environment's episode ended, shape (N,)
     :param infos: of the step
     :return: those whose episode was cut by a time limit, so that what would have followed counts
+    :raises NumericalError: if such an observation is not finite
     """
-    return [
+    endings = [
         TerminalObservation(step, env, infos[env]["terminal_observation"])
         for env in np.flatnonzero(dones).tolist()
         if infos[env].get("TimeLimit.truncated", False) and infos[env].get("terminal_observation") is not None
     ]
+    for ending in endings:
+        check_finite_step("terminal observation", _stack([ending.observation]), step, ending.env)
+    return endings
 
 
 def evaluate_rollout(
@@ -98,7 +106,6 @@ def evaluate_rollout(
     check_finite_rollout("value", values)
     check_finite_rollout("log-probability", log_probs)
     rollout_buffer.set_values(values, log_probs, _bootstrap_values(policy, terminal, shape))
-    check_finite_step("observation", last_observations, len(values))
     return _predict_values(policy, last_observations)
 
 
@@ -115,16 +122,17 @@ def reward_returns(rollout_buffer: GAERolloutBuffer) -> np.ndarray:
     """
     :param rollout_buffer: full
     :return: discounted returns of the rewards alone, no value function involved, shape (T, N)
+    :raises NumericalError: if a return is not finite
     """
     nothing = np.zeros_like(rollout_buffer.rewards)
-    return discounted_returns(rollout_buffer.rewards, nothing, rollout_buffer.dones, rollout_buffer.gamma)
+    returns = discounted_returns(rollout_buffer.rewards, nothing, rollout_buffer.dones, rollout_buffer.gamma)
+    check_finite_rollout("discounted return", returns)
+    return returns
 
 
 def _bootstrap_values(policy: ActorCriticPolicy, terminal: list[TerminalObservation], shape: tuple[int, ...]) -> np.ndarray:
     bootstrap_values = np.zeros(shape, dtype=np.float32)
     if terminal:
-        for ending in terminal:
-            check_finite_step("terminal observation", _stack([ending.observation]), ending.step, ending.env)
         steps, envs = [ending.step for ending in terminal], [ending.env for ending in terminal]
         bootstrap_values[steps, envs] = _predict_values(policy, _stack([ending.observation for ending in terminal])).cpu()
     return bootstrap_values

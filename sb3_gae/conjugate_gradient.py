@@ -37,17 +37,22 @@ def conjugate_gradient(
     rhs: th.Tensor,
     max_steps: int,
     relative_tolerance: float = 1e-6,
+    progress_tolerance: float = 0.0,
+    preconditioner: Callable[[th.Tensor], th.Tensor] | None = None,
 ) -> CGResult:
     """
     Solve ``A x = b`` from ``x = 0``.
 
     Starting from zero makes every iterate an ascent direction of ``b``, which a truncated solve needs,
-    and the tolerance is relative to ``b`` because gradients come in all scales.
+    and the tolerances are relative because gradients come in all scales.
 
     :param operator: product with ``A``, (n,) -> (n,)
     :param rhs: ``b``, shape (n,)
     :param max_steps: largest number of products
     :param relative_tolerance: end when the residual's norm is at most this times the norm of ``b``
+    :param progress_tolerance: end when a step adds at most this part of what all have added to the quadratic
+        ``b.x - x.Ax / 2`` (the rule of Martens 2010): further steps then follow noise in the curvature
+    :param preconditioner: product with a symmetric positive definite approximation of the inverse of ``A``
     :return: the solution and how it was reached
     """
     solution = th.zeros_like(rhs)
@@ -60,25 +65,32 @@ def conjugate_gradient(
     rhs_norm = largest * (rhs / largest).norm()
     target = rhs / rhs_norm
     residual = target.clone()
-    direction = residual.clone()
-    residual_square = residual.dot(residual)
-    status, steps = CGStatus.MAX_STEPS, 0
+    preconditioned = residual if preconditioner is None else preconditioner(residual)
+    direction = preconditioned.clone()
+    slope = residual.dot(preconditioned)
+    status, steps, steepest, total_gain = CGStatus.MAX_STEPS, 0, 0.0, 0.0
     for _ in range(max_steps):
         product = operator(direction)
         curvature = direction.dot(product)
         if not th.isfinite(curvature):
             status = CGStatus.NON_FINITE
             break
-        if curvature <= 0.0:
+        # Curvature that is zero but for rounding counts as zero: a step of its inverse would lead anywhere
+        direction_square = direction.dot(direction)
+        steepest = max(steepest, float(curvature / direction_square))
+        if curvature <= th.finfo(rhs.dtype).eps * steepest * direction_square:
             status = CGStatus.NON_POSITIVE_CURVATURE
             break
-        step = residual_square / curvature
+        step = slope / curvature
         solution.add_(direction * step)
         residual.sub_(product * step)
         steps += 1
-        previous_square, residual_square = residual_square, residual.dot(residual)
-        if residual_square <= relative_tolerance**2:
+        gain = float(0.5 * step * slope)
+        total_gain += gain
+        if residual.norm() <= relative_tolerance or gain <= progress_tolerance * total_gain:
             status = CGStatus.CONVERGED
             break
-        direction = residual + direction * (residual_square / previous_square)
+        preconditioned = residual if preconditioner is None else preconditioner(residual)
+        previous_slope, slope = slope, residual.dot(preconditioned)
+        direction = preconditioned + direction * (slope / previous_slope)
     return CGResult(solution * rhs_norm, (target - residual) * rhs_norm, status, steps)

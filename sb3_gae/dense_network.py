@@ -19,7 +19,7 @@ _DERIVATIVES: dict[type[nn.Module], Callable[[Any, th.Tensor], th.Tensor]] = {
     nn.Tanh: lambda _, h: 1.0 - h * h,
     nn.Sigmoid: lambda _, h: h * (1.0 - h),
     nn.ReLU: lambda _, h: (h > 0).to(h.dtype),
-    nn.LeakyReLU: lambda module, h: th.where(h > 0, 1.0, module.negative_slope).to(h.dtype),
+    nn.LeakyReLU: lambda module, h: th.full_like(h, module.negative_slope).masked_fill_(h > 0, 1.0),
     nn.ELU: lambda module, h: th.where(h > 0, 1.0, h + module.alpha),
 }
 
@@ -122,6 +122,25 @@ class DenseNetwork:
         return result
 
     @th.no_grad()
+    def kronecker_factors(self, cotangents: th.Tensor) -> list[tuple[th.Tensor, th.Tensor]]:
+        """
+        Second moments from which a layer's block of the curvature is approximated as a Kronecker product.
+
+        :param cotangents: one for each output, with the output metric as their covariance, shape (B, n_out)
+        :return: for each layer the mean outer product of its inputs, with a 1 appended for the bias, and that of the
+            cotangents at its output: shapes (n_in + 1, n_in + 1) and (n_out, n_out)
+        """
+        factors: dict[int, tuple[th.Tensor, th.Tensor]] = {}
+        for index, block in enumerate(cotangents.split(_BLOCK_ROWS)):
+            for layer, hidden, at_layer in self._backward(index, block):
+                if self.layers[layer][0].bias is not None:
+                    hidden = th.cat([hidden, hidden.new_ones(len(hidden), 1)], dim=1)
+                moments = hidden.t() @ hidden / self.batch_size, at_layer.t() @ at_layer / self.batch_size
+                before = factors.get(layer, (0.0, 0.0))
+                factors[layer] = (before[0] + moments[0], before[1] + moments[1])
+        return [factors[layer] for layer in range(len(self.layers))]
+
+    @th.no_grad()
     def jvp(self, vector: th.Tensor) -> th.Tensor:
         """
         :param vector: a direction in parameter space, shape (n,)
@@ -145,14 +164,19 @@ class DenseNetwork:
         return tangent
 
     def _accumulate_vjp(self, index: int, cotangent: th.Tensor, gradients: list[tuple[th.Tensor, th.Tensor | None]]) -> None:
-        hiddens, derivatives = self._inputs[index], self._derivatives[index]
+        for layer, hidden, at_layer in self._backward(index, cotangent):
+            weight, bias = gradients[layer]
+            weight.addmm_(at_layer.t(), hidden)
+            if bias is not None:
+                bias.add_(at_layer.sum(0))
+
+    def _backward(self, index: int, cotangent: th.Tensor) -> Iterator[tuple[int, th.Tensor, th.Tensor]]:
+        """Each linear layer of a block from the last to the first, with its inputs and the cotangents at its output."""
         for layer in range(len(self.layers) - 1, -1, -1):
-            derivative, (weight, bias) = derivatives[layer], gradients[layer]
+            derivative = self._derivatives[index][layer]
             if derivative is not None:
                 cotangent = cotangent * derivative
-            weight.addmm_(cotangent.t(), hiddens[layer])
-            if bias is not None:
-                bias.add_(cotangent.sum(0))
+            yield layer, self._inputs[index][layer], cotangent
             if layer > 0:
                 cotangent = cotangent @ self.layers[layer][0].weight
 

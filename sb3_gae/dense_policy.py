@@ -70,7 +70,10 @@ def _policy_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
 
 def _value_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
     head = policy.value_net
-    return _layers(policy, "value_net", head.unscaled() if isinstance(head, ValueHead) else head)
+    # A head that does more than scale stays as it is, and so is refused
+    if type(head) is ValueHead and not head._forward_hooks and not head._forward_pre_hooks:
+        head = head.unscaled()
+    return _layers(policy, "value_net", head)
 
 
 def _layers(policy: ActorCriticPolicy, body: str, head: nn.Module) -> list[nn.Module]:

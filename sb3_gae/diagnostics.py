@@ -11,5 +11,6 @@ def explained_variance(predictions: np.ndarray, targets: np.ndarray) -> float:
     :param targets: same shape
     :return: not a number if the targets are constant, as in SB3
     """
-    variance = np.var(targets)
-    return float("nan") if variance == 0 else float(1.0 - np.var(targets - predictions) / variance)
+    # In double precision: the squares of returns of 1e20 overflow single
+    variance = np.var(targets, dtype=np.float64)
+    return float("nan") if variance == 0 else float(1.0 - np.var(targets - predictions, dtype=np.float64) / variance)

@@ -56,6 +56,7 @@ def check_hyperparameters(model: "TRPOGAE") -> None:
         check_number(name, getattr(model, name), 0.0, above=True, below=True)
     for name in ("cg_damping", "vf_cg_damping"):
         check_number(name, getattr(model, name), 0.0, below=True)
+    check_number("cg_tolerance", model.cg_tolerance, 0.0, 1.0, below=True)
     check_number("line_search_shrinking_factor", model.line_search_shrinking_factor, 0.0, 1.0, above=True, below=True)
     for name in ("n_steps", "cg_max_steps", "vf_cg_max_steps", "line_search_max_iter", "sub_sampling_factor", "batch_size"):
         check_count(name, getattr(model, name))

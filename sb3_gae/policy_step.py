@@ -9,10 +9,11 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-from sb3_gae.batch import TrainingBatch, take
+from sb3_gae.batch import TrainingBatch
 from sb3_gae.curvature import CurvatureProduct, hessian_product
 from sb3_gae.dense_policy import dense_policy_network, has_dense_policy, policy_log_std
 from sb3_gae.distributions import distribution_from_outputs, fisher_metric, mean_kl, snapshot
+from sb3_gae.kronecker import KroneckerPreconditioner
 from sb3_gae.parameters import flat_gradient, influencing_parameters
 from sb3_gae.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
 
@@ -49,9 +50,9 @@ def policy_step(
     :return: what was done
     :raises NumericalError: if the gradient or a curvature product is not finite
     """
-    observations = batch.observations if curvature_subset is None else take(batch.observations, curvature_subset)
+    curvature_batch = batch if curvature_subset is None else batch.take(curvature_subset)
     make_problem = _dense_problem if has_dense_policy(policy, parameters) else _autograd_problem
-    return trust_region_step(make_problem(policy, parameters, batch, advantages, observations), settings)
+    return trust_region_step(make_problem(policy, parameters, batch, advantages, curvature_batch), settings)
 
 
 @dataclass
@@ -84,7 +85,7 @@ def _autograd_problem(
     parameters: Sequence[th.Tensor],
     batch: TrainingBatch,
     advantages: th.Tensor,
-    curvature_observations: PyTorchObs,
+    curvature_batch: TrainingBatch,
 ) -> LocalProblem:
     """For any policy that can be differentiated twice."""
     with th.no_grad():
@@ -97,7 +98,7 @@ def _autograd_problem(
         parameters=parameters,
         objective=surrogate.item(),
         gradient=flat_gradient(surrogate, parameters),
-        curvature=autograd_fisher_product(policy, parameters, curvature_observations),
+        curvature=autograd_fisher_product(policy, parameters, curvature_batch.observations),
         evaluate=_Trial(policy, batch, advantages, old, old_log_prob),
     )
 
@@ -107,7 +108,7 @@ def _dense_problem(
     parameters: Sequence[th.Tensor],
     batch: TrainingBatch,
     advantages: th.Tensor,
-    curvature_observations: PyTorchObs,
+    curvature_batch: TrainingBatch,
 ) -> LocalProblem:
     """The same for an MLP, several times as fast."""
     network, log_std = dense_policy_network(policy, batch.observations), policy_log_std(policy)
@@ -117,13 +118,15 @@ def _dense_problem(
         old_log_prob = old.log_prob(batch.actions)
     log_prob = distribution_from_outputs(policy.action_dist, outputs.requires_grad_(), log_std).log_prob(batch.actions)
     surrogate = _surrogate(advantages, log_prob, old_log_prob)
+    fisher = DenseFisher(policy, curvature_batch.observations)
     cotangents, *log_std_gradient = th.autograd.grad(surrogate, [outputs, *log_std])
     return LocalProblem(
         name="policy",
         parameters=[*network.parameters, *log_std],
         objective=surrogate.item(),
         gradient=th.cat([network.vjp(cotangents), *log_std_gradient]),
-        curvature=dense_fisher_product(policy, curvature_observations),
+        curvature=fisher.product,
+        precondition=fisher.precondition if fisher.prepare(curvature_batch.actions) else None,
         evaluate=_Trial(policy, batch, advantages, old, old_log_prob),
     )
 
@@ -144,22 +147,59 @@ def autograd_fisher_product(
     return hessian_product(mean_kl(old, policy.get_distribution(observations)), parameters)
 
 
-def dense_fisher_product(policy: ActorCriticPolicy, observations: PyTorchObs) -> CurvatureProduct:
+class DenseFisher:
     r"""
-    Products with the mean Fisher matrix :math:`\frac1B \sum_n J_n^\top M_n J_n`, for an MLP.
+    The mean Fisher matrix :math:`\frac1B \sum_n J_n^\top M_n J_n` of an MLP policy, n by n.
+
+    Vectors are in the order of the layers, followed by the logarithm of a Gaussian's standard deviations.
 
     :param policy: one that :func:`~sb3_gae.dense_policy.has_dense_policy`
     :param observations: B samples
-    :return: maps (n,) to (n,); the order is that of the layers, and then the logarithm of the standard deviations
     """
-    network = dense_policy_network(policy, observations)
-    with th.no_grad():
-        old = snapshot(distribution_from_outputs(policy.action_dist, network.forward(), policy_log_std(policy)))
-    metric, n_layers = fisher_metric(old), network.n_parameters
 
-    def product(vector: th.Tensor) -> th.Tensor:
-        layers = network.gauss_newton_product(vector[:n_layers], metric) / network.batch_size
-        # The Fisher information of a Gaussian about the logarithm of its standard deviation is 2, in every state
-        return th.cat([layers, 2.0 * vector[n_layers:]])
+    def __init__(self, policy: ActorCriticPolicy, observations: PyTorchObs):
+        self._network = dense_policy_network(policy, observations)
+        self._outputs = self._network.forward().requires_grad_()
+        self._distribution = snapshot(distribution_from_outputs(policy.action_dist, self._outputs, policy_log_std(policy)))
+        self._preconditioner: KroneckerPreconditioner | None = None
+        with th.no_grad():
+            old = snapshot(distribution_from_outputs(policy.action_dist, self._outputs, policy_log_std(policy)))
+        self._metric = fisher_metric(old)
 
-    return product
+    def product(self, vector: th.Tensor) -> th.Tensor:
+        """
+        :param vector: shape (n,)
+        :return: the matrix times the vector, shape (n,)
+        """
+        of_layers, of_log_std = vector.split([self._network.n_parameters, len(vector) - self._network.n_parameters])
+        layers = self._network.gauss_newton_product(of_layers, self._metric) / self._network.batch_size
+        return th.cat([layers, _LOG_STD_INFORMATION * of_log_std])
+
+    def prepare(self, actions: th.Tensor) -> bool:
+        r"""
+        Get ready for :meth:`precondition`. The score of actions that the policy itself has drawn has the metric
+        :math:`M` as its covariance, so the batch's own actions give the second moments without sampling anew.
+
+        :param actions: drawn in the states of the observations, B of them
+        :return: whether the network is one that preconditioning suits
+        """
+        if not KroneckerPreconditioner.suits(self._network):
+            return False
+        (scores,) = th.autograd.grad(self._distribution.log_prob(actions).sum(), self._outputs)
+        self._preconditioner = KroneckerPreconditioner(self._network, scores)
+        return True
+
+    def precondition(self, vector: th.Tensor, damping: float) -> th.Tensor:
+        """
+        :param vector: shape (n,)
+        :param damping: multiple of the identity that is added to the matrix, positive
+        :return: about the inverse of the damped matrix times the vector, shape (n,)
+        """
+        assert self._preconditioner is not None
+        of_layers, of_log_std = vector.split([self._network.n_parameters, len(vector) - self._network.n_parameters])
+        layers = self._preconditioner(of_layers, 1.0, damping)
+        return th.cat([layers, of_log_std / (_LOG_STD_INFORMATION + damping)])
+
+
+# Fisher information of a Gaussian about the logarithm of its standard deviation, in every state
+_LOG_STD_INFORMATION = 2.0

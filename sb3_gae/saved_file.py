@@ -2,6 +2,7 @@
 
 import io
 import json
+import lzma
 import pathlib
 import struct
 import zipfile
@@ -12,24 +13,31 @@ from stable_baselines3.common.save_util import open_path
 #: an attribute that only models of this package have
 _MARK = "vf_trust_region"
 
+#: what reading a damaged archive may raise, and an archive that holds something else
+_DAMAGE = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError),
+    *(LookupError, ValueError, RuntimeError),
+)
 
-def check_saved_file(path: str | pathlib.Path | io.BufferedIOBase) -> None:
+
+def check_saved_file(path: str | pathlib.Path | io.BufferedIOBase, own: bool = True) -> None:
     """
     :param path: as for SB3's ``load``
-    :raises ValueError: if the file is damaged, or was not saved by :class:`~sb3_gae.TRPOGAE`
+    :param own: whether it must come from :class:`~sb3_gae.TRPOGAE`, and not from any algorithm of SB3
+    :raises ValueError: if the file is damaged, or was saved by another algorithm
     :raises FileNotFoundError: if there is none
     """
     file = open_path(path, "r", verbose=0, suffix="zip")
     try:
         names = _data_names(file)
-    except (zipfile.BadZipFile, zlib.error, struct.error, KeyError, ValueError, EOFError, OSError, RuntimeError) as error:
+    except _DAMAGE as error:
         raise ValueError(f"{path} is damaged, or is not a model that SB3 saved: {error}") from error
     finally:
         if file is path:
             file.seek(0)
         else:
             file.close()
-    if _MARK not in names:
+    if own and _MARK not in names:
         raise ValueError(
             f"{path} was saved by another algorithm than TRPOGAE. Load it with that one; "
             "`TRPOGAE(...).set_parameters(path)` takes over weights if the networks are the same."
@@ -42,4 +50,10 @@ def _data_names(file: io.BufferedIOBase) -> set[str]:
         damaged = archive.testzip()
         if damaged is not None:
             raise zipfile.BadZipFile(f"the checksum of {damaged} is wrong")
-        return set(json.loads(archive.read("data")))
+        # Damage to the directory can hide a member
+        for member in ("policy.pth", "policy.optimizer.pth"):
+            archive.getinfo(member)
+        data = json.loads(archive.read("data"))
+    if not isinstance(data, dict):
+        raise ValueError("its data is not a dictionary")
+    return set(data)

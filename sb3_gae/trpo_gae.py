@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gae.adam_fit import adam_fit
 from sb3_gae.batch import TrainingBatch, random_subset
-from sb3_gae.checks import check_finite_rollout, check_finite_step
+from sb3_gae.checks import check_finite_parameters, check_finite_rollout, check_finite_step
 from sb3_gae.collection import (
     Observations,
     TerminalObservation,
@@ -84,6 +84,8 @@ class TRPOGAE(OnPolicyAlgorithm):
     :param vf_steps: largest number of value steps a rollout
     :param vf_cg_max_steps: largest number of conjugate-gradient steps for a value step
     :param vf_cg_damping: added to the diagonal of the Gauss-Newton matrix over :math:`\sigma^2` while solving
+    :param cg_tolerance: conjugate gradient ends when a step adds less than this part of what all have added,
+        for policy and value function; 0 runs to the largest number of steps or to convergence
     :param vf_optimizer: ``"trust_region"``, or ``"adam"`` for the fit of sb3-contrib's TRPO
     :param normalize_value: whether the value network's outputs are in units of a running scale of the returns
     :param curvature_samples: largest number of samples that curvature products use, drawn at random; None for all.
@@ -133,7 +135,8 @@ class TRPOGAE(OnPolicyAlgorithm):
         vf_trust_region: float = 0.2,
         vf_steps: int = 5,
         vf_cg_max_steps: int = 10,
-        vf_cg_damping: float = 1e-3,
+        vf_cg_damping: float = 1e-2,
+        cg_tolerance: float = 0.1,
         vf_optimizer: str = "trust_region",
         normalize_value: bool = True,
         curvature_samples: int | None = 10_000,
@@ -178,6 +181,7 @@ class TRPOGAE(OnPolicyAlgorithm):
         self.vf_steps = vf_steps
         self.vf_cg_max_steps = vf_cg_max_steps
         self.vf_cg_damping = vf_cg_damping
+        self.cg_tolerance = cg_tolerance
         self.vf_optimizer = vf_optimizer
         self.normalize_value = normalize_value
         self.curvature_samples = curvature_samples
@@ -214,9 +218,11 @@ class TRPOGAE(OnPolicyAlgorithm):
         :param rollout_buffer: to be filled
         :param n_rollout_steps: steps of each environment
         :return: False if the callback ended training before the buffer was full
-        :raises NumericalError: if an observation, action, reward or value is not finite
+        :raises NumericalError: if a parameter of the policy, an observation, action, reward or value is not finite
         """
         assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
+        check_finite_parameters(self.policy)
+        check_finite_step("observation", self._last_obs, 0)
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
         terminal: list[TerminalObservation] = []
@@ -232,6 +238,7 @@ class TRPOGAE(OnPolicyAlgorithm):
             clipped_actions = environment_actions(self.policy, actions)
             new_obs, rewards, dones, infos = env.step(clipped_actions)
             check_finite_step("reward", rewards, n_steps)
+            check_finite_step("observation", cast(Observations, new_obs), n_steps + 1)
 
             self.num_timesteps += env.num_envs
             callback.update_locals(locals())
@@ -313,6 +320,7 @@ class TRPOGAE(OnPolicyAlgorithm):
             radius=self.target_kl,
             cg_max_steps=self.cg_max_steps,
             cg_damping=self.cg_damping,
+            cg_progress_tolerance=self.cg_tolerance,
             shrinking_factor=self.line_search_shrinking_factor,
             max_trials=self.line_search_max_iter,
         )
@@ -320,7 +328,9 @@ class TRPOGAE(OnPolicyAlgorithm):
         return policy_step(self.policy, parameters, batch, advantages, settings, curvature_subset)
 
     def _fit_value(self, batch: TrainingBatch, parameters: list[th.Tensor]) -> ValueFitRecord:
-        if (head := self._value_head()) is not None:
+        head = self._value_head()
+        # A head that is frozen, or that the policy depends on as well, keeps its bits
+        if head is not None and any(parameter is head.weight for parameter in parameters):
             head.update_scale(batch.value_targets)
         if self.vf_optimizer == "adam":
             return adam_fit(self.policy, parameters, self.rollout_buffer, self.n_critic_updates, self.batch_size)
@@ -328,6 +338,7 @@ class TRPOGAE(OnPolicyAlgorithm):
             radius=self.vf_trust_region,
             cg_max_steps=self.vf_cg_max_steps,
             cg_damping=self.vf_cg_damping,
+            cg_progress_tolerance=self.cg_tolerance,
             shrinking_factor=self.line_search_shrinking_factor,
             max_trials=self.line_search_max_iter,
             max_scale=1.0,
@@ -342,7 +353,7 @@ class TRPOGAE(OnPolicyAlgorithm):
         returns = targets.cpu().numpy()
         taken = [step for step in value_record.steps if step.accepted]
         self.logger.record("train/policy_objective", policy_record.objective_after)
-        self.logger.record("train/value_loss", errors.square().mean().item())
+        self.logger.record("train/value_loss", errors.double().square().mean().item())
         self.logger.record("train/kl_divergence_loss", policy_record.divergence)
         self.logger.record("train/explained_variance", explained_variance(before, returns))
         self.logger.record("train/explained_variance_after", explained_variance(after, returns))
@@ -379,7 +390,10 @@ class TRPOGAE(OnPolicyAlgorithm):
         :param load_path_or_dict: a saved file, or what :meth:`get_parameters` returns
         :param exact_match: whether every parameter must be given
         :param device: on which to load
+        :raises ValueError: if something does not fit, or the file is damaged
         """
+        if not isinstance(load_path_or_dict, dict):
+            check_saved_file(load_path_or_dict, own=False)
         before = copy.deepcopy(self.get_parameters())
         try:
             super().set_parameters(load_path_or_dict, exact_match, device)

@@ -26,6 +26,8 @@ class LocalProblem:
     :param objective: its value now
     :param gradient: of the objective, shape (n,)
     :param curvature: product with the Hessian of the divergence from the present parameters, (n,) -> (n,)
+    :param precondition: given a vector (n,) and the damping, about the inverse of the damped curvature times the
+        vector; None if no such approximation is at hand
     :param evaluate: the objective, and the divergence from where the step began, at whatever the parameters then are
     """
 
@@ -35,6 +37,7 @@ class LocalProblem:
     gradient: th.Tensor
     curvature: CurvatureProduct
     evaluate: Callable[[], tuple[float, float]]
+    precondition: Callable[[th.Tensor, float], th.Tensor] | None = None
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,7 @@ class TrustRegionSettings:
     :param radius: largest divergence that a step may cause
     :param cg_max_steps: largest number of curvature products for the direction
     :param cg_damping: multiple of the identity that is added to the curvature while solving for the direction
+    :param cg_progress_tolerance: the solver ends when a product brings less than this part of what all have brought
     :param shrinking_factor: each further trial is this times as long
     :param max_trials: number of lengths that are tried
     :param max_scale: longest step as a multiple of the solution of the linear system; 1 for an objective
@@ -52,6 +56,7 @@ class TrustRegionSettings:
     radius: float
     cg_max_steps: int
     cg_damping: float
+    cg_progress_tolerance: float = 0.0
     shrinking_factor: float = 0.8
     max_trials: int = 10
     max_scale: float = math.inf
@@ -89,9 +94,7 @@ def trust_region_step(problem: LocalProblem, settings: TrustRegionSettings) -> S
     :return: what was done
     :raises NumericalError: if the gradient or a curvature product is not finite; no parameter has moved then
     """
-    solved = conjugate_gradient(
-        lambda vector: problem.curvature(vector) + settings.cg_damping * vector, problem.gradient, settings.cg_max_steps
-    )
+    solved = _direction(problem, settings)
     if solved.status is CGStatus.NON_FINITE:
         what = "gradient" if not th.isfinite(problem.gradient).all() else "curvature product"
         raise NumericalError(f"The {what} of the {problem.name} contains NaN or infinity; the step was not taken.")
@@ -101,13 +104,27 @@ def trust_region_step(problem: LocalProblem, settings: TrustRegionSettings) -> S
     return _line_search(problem, settings, scale * solved.solution, solved)
 
 
+def _direction(problem: LocalProblem, settings: TrustRegionSettings) -> CGResult:
+    damping, precondition = settings.cg_damping, problem.precondition
+    return conjugate_gradient(
+        lambda vector: problem.curvature(vector) + damping * vector,
+        problem.gradient,
+        settings.cg_max_steps,
+        progress_tolerance=settings.cg_progress_tolerance,
+        # Without damping the approximation may be singular where the curvature is not
+        preconditioner=None if precondition is None or damping == 0.0 else lambda vector: precondition(vector, damping),
+    )
+
+
 def _radius_scale(solved: CGResult, settings: TrustRegionSettings) -> float:
     r"""
     The :math:`\alpha` with :math:`\frac12 (\alpha s)^\top H (\alpha s)` equal to the radius.
 
     :math:`H` is without the damping: that belongs to the solver, not to the constraint.
     """
-    curvature = float(solved.solution.dot(solved.product - settings.cg_damping * solved.solution))
+    # In double precision: the squares of a solution of 1e-30 or 1e30 would leave the range of single precision
+    solution, product = solved.solution.double(), solved.product.double()
+    curvature = float(solution.dot(product - settings.cg_damping * solution))
     if not curvature > 0.0:
         return 0.0
     return math.sqrt(2.0 * settings.radius / curvature)

@@ -51,10 +51,10 @@ class ValueHead(nn.Linear):
         """
         Set the factor once, before the first values are used, from returns that owe nothing to the network.
 
-        :param returns: any shape; all zeros leave the factor at 1
+        :param returns: any shape; all zeros, or next to it, leave the factor at 1
         """
         root_mean_square = _root_mean_square(returns)
-        if self.n_batches == 0 and root_mean_square > 0.0:
+        if self.n_batches == 0 and _can_divide_by(root_mean_square):
             self.scale.fill_(root_mean_square)
 
     @th.no_grad()
@@ -67,7 +67,7 @@ class ValueHead(nn.Linear):
         self.n_batches += 1
         weight = max(self.momentum, 1.0 / int(self.n_batches))
         new_scale = th.hypot(self.scale * (1.0 - weight) ** 0.5, _root_mean_square(value_targets) * weight**0.5)
-        if new_scale > 0.0:
+        if _can_divide_by(new_scale):
             ratio = self.scale / new_scale
             self.weight.mul_(ratio)
             if self.bias is not None:
@@ -75,9 +75,16 @@ class ValueHead(nn.Linear):
             self.scale.copy_(new_scale)
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
-        for name in ("scale", "n_batches"):
+        # Weights without a scale are those of a plain layer; where there are none, this layer keeps its scale
+        for name in ("scale", "n_batches") if prefix + "weight" in state_dict else ():
             state_dict.setdefault(prefix + name, th.ones_like(getattr(self, name)))
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _can_divide_by(scale: th.Tensor) -> bool:
+    """False for zero, and where a number near 1 over the scale would be near overflow."""
+    limits = th.finfo(scale.dtype)
+    return bool(scale > limits.tiny / limits.eps)
 
 
 def _root_mean_square(values: th.Tensor) -> th.Tensor:

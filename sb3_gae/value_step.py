@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_gae.batch import TrainingBatch, in_chunks, take
 from sb3_gae.curvature import CurvatureProduct, hessian_product
 from sb3_gae.dense_policy import dense_value_network, has_dense_value
+from sb3_gae.kronecker import KroneckerPreconditioner
 from sb3_gae.parameters import flat_gradient, influencing_parameters
 from sb3_gae.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
 from sb3_gae.value_head import ValueHead
@@ -80,7 +81,7 @@ def value_steps(
     scale = value_scale(policy)
     fit = _Fit(make_model(policy, parameters, batch.observations, observations), batch.value_targets / scale)
     before, records = fit.values, []
-    for _ in range(n_steps):
+    for _ in range(n_steps if parameters else 0):
         if fit.variance == 0.0:
             break
         records.append(fit.step(settings))
@@ -112,6 +113,9 @@ class _Values(Protocol):
     def gauss_newton_product(self) -> CurvatureProduct:
         """Products with the mean of the Jacobian's outer products over the curvature's samples, at the same parameters."""
 
+    def preconditioner(self) -> KroneckerPreconditioner | None:
+        """About the inverse of that matrix, after :meth:`gauss_newton_product`; None if it is not known."""
+
 
 class _DenseValues:
     """An MLP; the activations of the last :meth:`values` serve the gradient and the products of the next step."""
@@ -141,6 +145,12 @@ class _DenseValues:
             network.forward()
         return lambda vector: network.gauss_newton_product(vector, lambda tangents, rows: tangents) / network.batch_size
 
+    def preconditioner(self) -> KroneckerPreconditioner | None:
+        network = self._curvature_network
+        if not KroneckerPreconditioner.suits(network):
+            return None
+        return KroneckerPreconditioner(network, self.parameters[0].new_ones(network.batch_size, 1))
+
 
 class _AutogradValues:
     """Any value function that can be differentiated twice."""
@@ -166,6 +176,9 @@ class _AutogradValues:
     def gauss_newton_product(self) -> CurvatureProduct:
         values = self._predict(self._curvature_observations)
         return hessian_product(0.5 * (values - values.detach()).square().mean(), self.parameters)
+
+    def preconditioner(self) -> KroneckerPreconditioner | None:
+        return None
 
     def _predict(self, observations: PyTorchObs) -> th.Tensor:
         return self._policy.predict_values(observations).squeeze(1) / value_scale(self._policy)
@@ -194,7 +207,7 @@ class _Fit:
 
     def _local_problem(self) -> LocalProblem:
         old_values, variance = self.values, self.variance
-        product = self._model.gauss_newton_product()
+        product, preconditioner = self._model.gauss_newton_product(), self._model.preconditioner()
 
         def evaluate() -> tuple[float, float]:
             self.values = self._model.values()
@@ -208,4 +221,7 @@ class _Fit:
             gradient=self._model.vjp((self._targets - old_values) / (len(old_values) * variance)),
             curvature=lambda vector: product(vector) / variance,
             evaluate=evaluate,
+            precondition=None
+            if preconditioner is None
+            else lambda vector, damping: preconditioner(vector, 1.0 / variance, damping),
         )

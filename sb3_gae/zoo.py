@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from torch import nn
 
 from sb3_gae.trpo_gae import TRPOGAE
+from sb3_gae.zoo_hub_repairs import repair_hub_verbs
 
 if TYPE_CHECKING:
     import optuna
@@ -87,6 +88,8 @@ def integrate(module: ModuleType) -> None:
 def _add_algorithm(utils: ModuleType) -> None:
     _expect(utils, "ALGOS", dict)[ALGO] = TRPOGAE
     _translate_card_names(utils)
+    if "huggingface_sb3" in sys.modules:
+        repair_hub_verbs(sys.modules["huggingface_sb3"])
 
 
 def _translate_card_names(utils: ModuleType) -> None:

@@ -1,0 +1,66 @@
+# Every habit is one word. The set-up comes by itself: a .venv with what constraints.txt pins.
+#
+#   make train                     train CartPole-v1 through rl-zoo3 (more arguments: ARGS="--seed 1")
+#   make test                      run the tests (fewer of them: ARGS="tests/test_zoo_hook.py -k spawn")
+#   make check                     formatting, lint, types
+#   make format                    put formatting right
+#   make bench                     run what is in benchmarks/
+#   make clean                     remove .venv and what builds and tools left
+#   make PYTHON=python3.12 train   choose an interpreter
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# Written last, so that a .venv without it is half-made
+STAMP := $(VENV)/.installed
+SETUP_FILES := setup.cfg setup.py pyproject.toml constraints.txt sb3_gae_zoo_hook.pth sb3_gae_zoo_hook.start
+WHICH_PYTHON := -c 'import sys; print(sys.version)'
+
+# Make the .venv anew if its Python does not run, or another one was asked for
+IN_PLACE := $(shell $(BIN)/python $(WHICH_PYTHON) 2>/dev/null)
+ifeq ($(IN_PLACE),)
+ANEW := FORCE
+else ifneq ($(origin PYTHON),file)
+ifneq ($(shell $(PYTHON) $(WHICH_PYTHON) 2>/dev/null),$(IN_PLACE))
+ANEW := FORCE
+endif
+endif
+
+# Commands are run by name, as one would type them
+IN_VENV := PATH="$(CURDIR)/$(BIN):$$PATH"
+
+.PHONY: FORCE setup train test check format bench clean
+
+setup: $(STAMP)
+
+$(STAMP): $(SETUP_FILES) $(ANEW)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+		{ echo "sb3-gae needs Python 3.11 or newer, but $(PYTHON) is $$($(PYTHON) --version 2>/dev/null || echo missing)." \
+			"Choose one: make PYTHON=python3.12 $(or $(MAKECMDGOALS),setup)" >&2; exit 1; }
+	@$(if $(ANEW),rm -f $@)
+	test -f $@ || $(PYTHON) -m venv --clear $(VENV)
+	@rm -f $@
+	$(BIN)/python -m pip install -c constraints.txt -e ".[tests]"
+	@touch $@
+
+train: $(STAMP)
+	$(IN_VENV) python -m rl_zoo3.train --algo trpo_gae --env CartPole-v1 --progress $(ARGS)
+
+test: $(STAMP)
+	$(IN_VENV) python -m pytest $(ARGS)
+
+check: $(STAMP)
+	$(IN_VENV) ruff format --check .
+	$(IN_VENV) ruff check .
+	$(IN_VENV) mypy
+
+format: $(STAMP)
+	$(IN_VENV) ruff format .
+	$(IN_VENV) ruff check --fix .
+
+bench: $(STAMP)
+	@for script in $(wildcard benchmarks/*.py); do echo "python $$script"; $(IN_VENV) python $$script || exit 1; done
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks docs/_build
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
