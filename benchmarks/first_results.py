@@ -16,7 +16,7 @@ import re
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import NamedTuple
 
@@ -102,8 +102,8 @@ def main() -> None:
         known = {(row["env"], int(row["seed"])) for row in stored()}
         left = [(task, seed) for task in TASKS for seed in task.seeds if (task.env, seed) not in known]
         with ThreadPoolExecutor(args.jobs) as pool:
-            for future in [pool.submit(run, task, seed, args.folder) for task, seed in left]:
-                future.add_done_callback(lambda done: store(done.result()))
+            for done in as_completed([pool.submit(run, task, seed, args.folder) for task, seed in left]):
+                store(done.result())
     summary()
 
 

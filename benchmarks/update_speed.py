@@ -30,7 +30,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_gae import TRPOGAE, GAERolloutBuffer
 from sb3_gae.diagnostics import explained_variance
-from sb3_gae.policies import LOCOMOTION_NETWORKS
+from sb3_gae.presets import LOCOMOTION_NETWORKS
 
 N_ENVS = 16
 N_STATES, N_ACTIONS = 33, 10

@@ -8,12 +8,16 @@ arXiv 1506.02438.
 from sb3_gae.callbacks import LambdaSweepCallback
 from sb3_gae.errors import NumericalError
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_gae.presets import CARTPOLE_NETWORKS, LOCOMOTION_NETWORKS, PAPER_VALUE_FIT
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer, LambdaSweep
 from sb3_gae.trpo_gae import TRPOGAE
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "CARTPOLE_NETWORKS",
+    "LOCOMOTION_NETWORKS",
+    "PAPER_VALUE_FIT",
     "TRPOGAE",
     "CnnPolicy",
     "GAEDictRolloutBuffer",

@@ -72,8 +72,8 @@ class TRPOGAE(OnPolicyAlgorithm):
     :param sub_sampling_factor: use every so many samples, at random, for the policy step
     :param stats_window_size: episodes to average in the logs
     :param tensorboard_log: directory for TensorBoard (None: no logging)
-    :param policy_kwargs: passed to the policy; :data:`~sb3_gae.policies.LOCOMOTION_NETWORKS` and
-        :data:`~sb3_gae.policies.CARTPOLE_NETWORKS` are those of the paper
+    :param policy_kwargs: passed to the policy; :data:`~sb3_gae.presets.LOCOMOTION_NETWORKS` and
+        :data:`~sb3_gae.presets.CARTPOLE_NETWORKS` are those of the paper
     :param verbose: 0 no output, 1 info, 2 debug
     :param seed: for the pseudo-random generators
     :param device: on which to run

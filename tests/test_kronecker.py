@@ -1,5 +1,7 @@
 """The preconditioner against dense linear algebra."""
 
+import itertools
+
 import pytest
 import torch as th
 from torch import nn
@@ -13,7 +15,7 @@ def network_of(sizes: list[int], n_samples: int, bias: bool = True) -> DenseNetw
     """A tanh network in double precision over random inputs, with its activations."""
     th.manual_seed(0)
     layers: list[nn.Module] = []
-    for n_in, n_out in zip(sizes, sizes[1:], strict=False):
+    for n_in, n_out in itertools.pairwise(sizes):
         layers += [nn.Linear(n_in, n_out, bias=bias).double(), nn.Tanh()]
     network = DenseNetwork(layers[:-1], th.randn(n_samples, sizes[0], dtype=th.double))
     network.forward()

@@ -460,12 +460,12 @@ def test_dropout_and_batch_statistics_rest_during_an_update(vf_optimizer: str) -
 
 
 def test_networks_of_the_paper_are_presets() -> None:
-    model = small_model(vec_env(), policy_kwargs=sb3_gae.policies.LOCOMOTION_NETWORKS)
+    model = small_model(vec_env(), policy_kwargs=sb3_gae.presets.LOCOMOTION_NETWORKS)
     policy_net, value_net = model.policy.mlp_extractor.policy_net, model.policy.mlp_extractor.value_net
     for net in (policy_net, value_net):
         assert [type(layer) for layer in net] == [nn.Linear, nn.Tanh] * 3
         assert [layer.out_features for layer in net[::2]] == [100, 50, 25]
-    model = small_model(vec_env(), policy_kwargs=sb3_gae.policies.CARTPOLE_NETWORKS)
+    model = small_model(vec_env(), policy_kwargs=sb3_gae.presets.CARTPOLE_NETWORKS)
     assert len(model.policy.mlp_extractor.policy_net) == 0
     assert [layer.out_features for layer in model.policy.mlp_extractor.value_net[::2]] == [20]
 

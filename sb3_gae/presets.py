@@ -1,0 +1,21 @@
+"""
+The paper's own choices, where it states them, to be unpacked into :class:`~sb3_gae.TRPOGAE`:
+
+.. code-block:: python
+
+    TRPOGAE("MlpPolicy", env, policy_kwargs=LOCOMOTION_NETWORKS, **PAPER_VALUE_FIT)
+"""
+
+from typing import Any
+
+from torch import nn
+
+#: ``policy_kwargs`` of the paper's cart-pole: a linear policy, a value network of 20 tanh units (section 6.2.1)
+CARTPOLE_NETWORKS: dict[str, Any] = dict(net_arch=dict(pi=[], vf=[20]), activation_fn=nn.Tanh)
+
+#: ``policy_kwargs`` of the paper's robots: 100, 50 and 25 tanh units for policy and value function (section 6.2.2)
+LOCOMOTION_NETWORKS: dict[str, Any] = dict(net_arch=dict(pi=[100, 50, 25], vf=[100, 50, 25]), activation_fn=nn.Tanh)
+
+#: the value fit of section 5: Monte-Carlo targets, and one trust-region step a batch. Meant for the paper's batches of
+#: 50 000 steps and more. The paper does not give ε; this one is ours
+PAPER_VALUE_FIT: dict[str, Any] = dict(value_lambda=1.0, vf_trust_region=0.01, vf_steps=1)

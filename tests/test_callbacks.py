@@ -1,0 +1,47 @@
+"""The sweep in the log."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_gae import TRPOGAE, GAERolloutBuffer, LambdaSweepCallback
+
+LAMBDAS = (0.0, 0.9, 1.0)
+
+
+class Record(BaseCallback):
+    """Keeps what is in the log when a rollout has ended and been swept."""
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self.logged = dict(self.logger.name_to_value)
+
+
+def test_the_log_holds_every_quantity_for_every_lambda_as_the_buffer_gives_it() -> None:
+    model = TRPOGAE("MlpPolicy", make_vec_env("CartPole-v1", 2, seed=0), n_steps=32, seed=0, device="cpu")
+    sweep, record = LambdaSweepCallback(LAMBDAS), Record()
+    model.learn(64, callback=[sweep, record])
+    expected = model.rollout_buffer.lambda_sweep(LAMBDAS)
+    assert sweep.sweep is not None
+    for quantity in ("mean_bias", "rms_difference", "variance", "effective_horizon", "explained_variance"):
+        np.testing.assert_allclose(getattr(sweep.sweep, quantity), getattr(expected, quantity))
+        logged = [record.logged[f"sweep/{quantity}/lambda_{gae_lambda:g}"] for gae_lambda in LAMBDAS]
+        np.testing.assert_allclose(logged, getattr(expected, quantity))
+
+
+def test_works_with_another_algorithm_on_our_buffer() -> None:
+    callback = LambdaSweepCallback(LAMBDAS)
+    PPO("MlpPolicy", gym.make("CartPole-v1"), n_steps=64, rollout_buffer_class=GAERolloutBuffer, device="cpu").learn(
+        64, callback
+    )
+    assert callback.sweep is not None
+
+
+def test_says_which_buffer_it_needs() -> None:
+    with pytest.raises(TypeError, match=r"GAERolloutBuffer, got RolloutBuffer"):
+        PPO("MlpPolicy", gym.make("CartPole-v1"), n_steps=64, device="cpu").learn(64, LambdaSweepCallback(LAMBDAS))
