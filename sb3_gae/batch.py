@@ -59,6 +59,34 @@ def batch_size(observations: PyTorchObs) -> int:
     return len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
 
 
+def as_float(observations: PyTorchObs) -> PyTorchObs:
+    """
+    Floats in the policy's precision, so that not every pass over the batch converts them; integers stay.
+
+    :param observations: shape (B, ...), or a dictionary of such
+    :return: likewise
+    """
+    if isinstance(observations, dict):
+        return {key: value.float() if value.is_floating_point() else value for key, value in observations.items()}
+    return observations.float() if observations.is_floating_point() else observations
+
+
+def standardized(advantages: th.Tensor) -> th.Tensor:
+    """
+    Mean 0 and deviation 1; in double precision, so that advantages of 1e-30 and 1e30 come out alike.
+
+    :param advantages: shape (B,)
+    :return: shape (B,); zeros if all are the same
+    """
+    wide = advantages.double()
+    centred = wide - wide.mean()
+    deviation = centred.std()
+    # A deviation that is only rounding must not be blown up to 1
+    if deviation <= th.finfo(advantages.dtype).eps * wide.abs().max():
+        return th.zeros_like(advantages)
+    return (centred / deviation).to(advantages.dtype)
+
+
 def random_subset(n_samples: int, at_most: int | None, device: th.device) -> th.Tensor | None:
     """
     Indices of a subset without replacement, from NumPy's global generator as SB3's own minibatches are.

@@ -1,4 +1,4 @@
-"""Pieces of the collection of a rollout: actions of a step, endings of a step, values of the whole."""
+"""Pieces of the collection of a rollout: actions of a step, endings of a step, values of the whole, and what to train on."""
 
 from typing import Any, NamedTuple
 
@@ -9,7 +9,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_gae.advantages import discounted_returns
-from sb3_gae.batch import in_chunks
+from sb3_gae.batch import TrainingBatch, as_float, in_chunks
 from sb3_gae.checks import check_finite_rollout, check_finite_step
 from sb3_gae.errors import NumericalError
 from sb3_gae.rollout_buffer import GAERolloutBuffer
@@ -116,6 +116,17 @@ def distribution_actions(action_space: spaces.Space, actions: th.Tensor) -> th.T
     :return: as the distribution takes them: whole numbers of shape (B,) for Discrete
     """
     return actions.long().flatten() if isinstance(action_space, spaces.Discrete) else actions
+
+
+def training_batch(rollout_buffer: GAERolloutBuffer, action_space: spaces.Space) -> TrainingBatch:
+    """
+    :param rollout_buffer: full, with its advantages computed
+    :param action_space: of the environment
+    :return: all of it, flattened, as the steps of an update take it
+    """
+    samples = rollout_buffer.batch()
+    actions = distribution_actions(action_space, samples.actions)
+    return TrainingBatch(as_float(samples.observations), actions, samples.advantages, samples.returns)
 
 
 def reward_returns(rollout_buffer: GAERolloutBuffer) -> np.ndarray:

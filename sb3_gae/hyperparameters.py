@@ -2,13 +2,10 @@
 
 import warnings
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sb3_gae.checks import check_choice, check_count, check_number
 from sb3_gae.rollout_buffer import GAERolloutBuffer
-
-if TYPE_CHECKING:
-    from sb3_gae.trpo_gae import TRPOGAE
 
 _STEP_SIZE = "the sizes of the steps are set by `target_kl` and `vf_trust_region`"
 _ADAM = "or pass `vf_optimizer='adam'` to fit the value function as sb3-contrib's TRPO does"
@@ -42,39 +39,39 @@ def warn_of_unused(passed: Mapping[str, Any], advice: Mapping[str, str]) -> None
         warnings.warn(f"`{name}` has no effect here: {advice[name]}.", UserWarning, stacklevel=4)
 
 
-def check_hyperparameters(model: "TRPOGAE") -> None:
+def check_hyperparameters(values: Mapping[str, Any]) -> None:
     """
-    :param model: with its attributes set, its networks not yet built
+    :param values: attributes of the algorithm by name, before its networks are built
     :raises ValueError: if one is outside its domain
     :raises TypeError: if the rollout buffer cannot keep what the algorithm needs
     """
-    check_number("gamma", model.gamma, 0.0, 1.0)
-    check_number("gae_lambda", model.gae_lambda, 0.0, 1.0)
-    if model.value_lambda is not None:
-        check_number("value_lambda", model.value_lambda, 0.0, 1.0)
+    for name in ("gamma", "gae_lambda"):
+        check_number(name, values[name], 0.0, 1.0)
+    if values["value_lambda"] is not None:
+        check_number("value_lambda", values["value_lambda"], 0.0, 1.0)
     for name in ("target_kl", "vf_trust_region"):
-        check_number(name, getattr(model, name), 0.0, above=True, below=True)
+        check_number(name, values[name], 0.0, above=True, below=True)
     for name in ("cg_damping", "vf_cg_damping"):
-        check_number(name, getattr(model, name), 0.0, below=True)
-    check_number("cg_tolerance", model.cg_tolerance, 0.0, 1.0, below=True)
-    check_number("line_search_shrinking_factor", model.line_search_shrinking_factor, 0.0, 1.0, above=True, below=True)
+        check_number(name, values[name], 0.0, below=True)
+    check_number("cg_tolerance", values["cg_tolerance"], 0.0, 1.0, below=True)
+    check_number("line_search_shrinking_factor", values["line_search_shrinking_factor"], 0.0, 1.0, above=True, below=True)
     for name in ("n_steps", "cg_max_steps", "vf_cg_max_steps", "line_search_max_iter", "sub_sampling_factor", "batch_size"):
-        check_count(name, getattr(model, name))
+        check_count(name, values[name])
     for name in ("vf_steps", "n_critic_updates"):
-        check_count(name, getattr(model, name), low=0)
-    if model.curvature_samples is not None:
-        check_count("curvature_samples", model.curvature_samples, low=2)
-    check_choice("vf_optimizer", model.vf_optimizer, ("trust_region", "adam"))
-    _check_batch(model)
-    _check_buffer_class(model.rollout_buffer_class)
+        check_count(name, values[name], low=0)
+    if values["curvature_samples"] is not None:
+        check_count("curvature_samples", values["curvature_samples"], low=2)
+    check_choice("vf_optimizer", values["vf_optimizer"], ("trust_region", "adam"))
+    _check_batch(values["n_steps"], values["n_envs"], values["sub_sampling_factor"])
+    _check_buffer_class(values["rollout_buffer_class"])
 
 
-def _check_batch(model: "TRPOGAE") -> None:
-    n_samples = model.n_steps * model.n_envs // model.sub_sampling_factor
+def _check_batch(n_steps: int, n_envs: int, sub_sampling_factor: int) -> None:
+    n_samples = n_steps * n_envs // sub_sampling_factor
     if n_samples < 2:
         raise ValueError(
-            f"A batch needs at least 2 samples, but `n_steps` = {model.n_steps} in {model.n_envs} environment(s) with "
-            f"`sub_sampling_factor` = {model.sub_sampling_factor} gives {n_samples}; raise `n_steps`."
+            f"A batch needs at least 2 samples, but `n_steps` = {n_steps} in {n_envs} environment(s) with "
+            f"`sub_sampling_factor` = {sub_sampling_factor} gives {n_samples}; raise `n_steps`."
         )
 
 

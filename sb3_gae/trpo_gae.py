@@ -16,19 +16,18 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gae.adam_fit import adam_fit
-from sb3_gae.batch import TrainingBatch, random_subset
+from sb3_gae.batch import TrainingBatch, random_subset, standardized
 from sb3_gae.checks import check_finite_parameters, check_finite_rollout, check_finite_step
 from sb3_gae.collection import (
     Observations,
     TerminalObservation,
-    distribution_actions,
     environment_actions,
     evaluate_rollout,
     reward_returns,
     sample_actions,
     terminal_observations,
+    training_batch,
 )
-from sb3_gae.diagnostics import explained_variance
 from sb3_gae.errors import NumericalError
 from sb3_gae.hyperparameters import ADAM_ARGUMENTS, FOREIGN_ARGUMENTS, check_hyperparameters, warn_of_unused
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
@@ -36,6 +35,7 @@ from sb3_gae.policy_step import policy_parameters, policy_step
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
 from sb3_gae.saved_file import check_saved_file
 from sb3_gae.trust_region import StepRecord, TrustRegionSettings
+from sb3_gae.update_summary import update_summary
 from sb3_gae.value_head import ValueHead
 from sb3_gae.value_step import ValueFitRecord, value_parameters, value_steps
 
@@ -199,7 +199,7 @@ class TRPOGAE(OnPolicyAlgorithm):
             warn_of_unused(passed, ADAM_ARGUMENTS)
 
     def _setup_model(self) -> None:
-        check_hyperparameters(self)
+        check_hyperparameters(vars(self))
         if self.rollout_buffer_class is None:
             is_dict = isinstance(self.observation_space, spaces.Dict)
             self.rollout_buffer_class = GAEDictRolloutBuffer if is_dict else GAERolloutBuffer
@@ -293,7 +293,7 @@ class TRPOGAE(OnPolicyAlgorithm):
         # Evaluation mode: the line search must compare one function, and batch statistics would move at each trial
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
-        batch = self._training_batch()
+        batch = training_batch(self.rollout_buffer, self.action_space)
         of_policy = policy_parameters(self.policy, batch)
         of_value = value_parameters(self.policy, batch, of_policy)
         if not of_policy:
@@ -306,13 +306,8 @@ class TRPOGAE(OnPolicyAlgorithm):
         self._n_updates += 1
         self._log_update(policy_record, value_record)
 
-    def _training_batch(self) -> TrainingBatch:
-        samples = self.rollout_buffer.batch()
-        actions = distribution_actions(self.action_space, samples.actions)
-        return TrainingBatch(_as_float(samples.observations), actions, samples.advantages, samples.returns)
-
     def _step_policy(self, batch: TrainingBatch, parameters: list[th.Tensor]) -> StepRecord:
-        advantages = _standardized(batch.advantages) if self.normalize_advantage else batch.advantages
+        advantages = standardized(batch.advantages) if self.normalize_advantage else batch.advantages
         if self.sub_sampling_factor > 1:
             subset = random_subset(len(batch), len(batch) // self.sub_sampling_factor, self.device)
             batch, advantages = batch.take(subset), advantages[subset]  # type: ignore[arg-type]
@@ -347,24 +342,10 @@ class TRPOGAE(OnPolicyAlgorithm):
         return value_steps(self.policy, parameters, batch, settings, self.vf_steps, curvature_subset)
 
     def _log_update(self, policy_record: StepRecord, value_record: ValueFitRecord) -> None:
-        targets = self.rollout_buffer.batch().returns
-        errors = value_record.values_after - targets
-        before, after = value_record.values_before.cpu().numpy(), value_record.values_after.cpu().numpy()
-        returns = targets.cpu().numpy()
-        taken = [step for step in value_record.steps if step.accepted]
-        self.logger.record("train/policy_objective", policy_record.objective_after)
-        self.logger.record("train/value_loss", errors.double().square().mean().item())
-        self.logger.record("train/kl_divergence_loss", policy_record.divergence)
-        self.logger.record("train/explained_variance", explained_variance(before, returns))
-        self.logger.record("train/explained_variance_after", explained_variance(after, returns))
-        self.logger.record("train/is_line_search_success", float(policy_record.accepted))
-        self.logger.record("train/line_search_trials", policy_record.trials)
-        self.logger.record("train/cg_steps", policy_record.cg_steps)
-        if value_record.steps:
-            self.logger.record("train/vf_steps", len(taken))
-            self.logger.record("train/vf_kl_divergence", max(step.divergence for step in value_record.steps))
-            self.logger.record("train/vf_cg_steps", sum(step.cg_steps for step in value_record.steps))
-        if isinstance(head := self._value_head(), ValueHead):
+        returns = self.rollout_buffer.returns.reshape(-1)
+        for name, value in update_summary(policy_record, value_record, returns).items():
+            self.logger.record(f"train/{name}", value)
+        if (head := self._value_head()) is not None:
             self.logger.record("train/value_scale", head.scale.item())
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
@@ -415,18 +396,3 @@ class TRPOGAE(OnPolicyAlgorithm):
         """
         check_saved_file(path)
         return super().load(path, env, *args, **kwargs)
-
-
-def _as_float(observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor | dict[str, th.Tensor]:
-    """Floats in the policy's precision, so that not every pass over the batch converts them; integers stay."""
-    if isinstance(observations, dict):
-        return {key: _as_float(value) for key, value in observations.items()}  # type: ignore[misc]
-    return observations.float() if observations.is_floating_point() else observations
-
-
-def _standardized(advantages: th.Tensor) -> th.Tensor:
-    """Mean 0 and deviation 1; in double precision, so that advantages of 1e-30 and 1e30 come out alike."""
-    wide = advantages.double()
-    centred = wide - wide.mean()
-    deviation = centred.std()
-    return (centred / deviation if deviation > 0.0 else centred).to(advantages.dtype)

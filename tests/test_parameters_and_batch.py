@@ -7,7 +7,7 @@ from oracles import jacobian
 from torch import nn
 
 from sb3_gae import batch as batch_module
-from sb3_gae.batch import TrainingBatch, batch_size, in_chunks, random_subset, take
+from sb3_gae.batch import TrainingBatch, batch_size, in_chunks, random_subset, standardized, take
 from sb3_gae.parameters import assign, flat_gradient, flatten, influencing_parameters, unflatten
 
 # --- Parameters ---
@@ -186,3 +186,17 @@ def test_pieces_are_without_a_graph() -> None:
     parameter = nn.Parameter(th.ones(2))
     assert not in_chunks(lambda part: part @ parameter, th.ones(3, 2)).requires_grad
     assert th.is_grad_enabled()
+
+
+@pytest.mark.parametrize("constant", [0.1, -1e30, 1e-30, 0.0])
+def test_standardizing_equal_advantages_gives_zeros_and_not_rounding_blown_up(constant: float) -> None:
+    advantages = th.full((1000,), constant)
+    assert th.equal(standardized(advantages), th.zeros(1000))
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1.0, 1e30])
+def test_standardizing_gives_mean_0_and_deviation_1_at_any_scale(scale: float) -> None:
+    advantages = scale * th.tensor([1.0, 2.0, 4.0])
+    expected = th.tensor([1.0, 2.0, 4.0], dtype=th.double)
+    expected = (expected - expected.mean()) / expected.std()
+    th.testing.assert_close(standardized(advantages).double(), expected, rtol=1e-5, atol=1e-6)
