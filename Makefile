@@ -4,7 +4,8 @@
 #   make test                      run the tests (fewer of them: ARGS="tests/test_zoo_hook.py -k spawn")
 #   make check                     formatting, lint, types
 #   make format                    put formatting right
-#   make bench                     run what is in benchmarks/
+#   make bench                     speed of an update beside sb3-contrib's
+#   make bench-full                also what the shipped settings reach (an hour)
 #   make clean                     remove .venv and what builds and tools left
 #   make PYTHON=python3.12 train   choose an interpreter
 
@@ -29,7 +30,7 @@ endif
 # Commands are run by name, as one would type them
 IN_VENV := PATH="$(CURDIR)/$(BIN):$$PATH"
 
-.PHONY: FORCE setup train test check format bench clean
+.PHONY: FORCE setup train test check format bench bench-full clean
 
 setup: $(STAMP)
 
@@ -59,7 +60,10 @@ format: $(STAMP)
 	$(IN_VENV) ruff check --fix .
 
 bench: $(STAMP)
-	@for script in $(wildcard benchmarks/*.py); do echo "python $$script"; $(IN_VENV) python $$script || exit 1; done
+	$(IN_VENV) python benchmarks/update_speed.py $(ARGS)
+
+bench-full: bench
+	$(IN_VENV) python benchmarks/first_results.py
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks docs/_build

@@ -18,7 +18,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -208,7 +207,7 @@ def main() -> None:
     if args.memory_of:
         memory_of_update(args.memory_of)
         return
-    print(f"torch {th.__version__}, {th.get_num_threads()} threads, {Path(sys.executable).name}")
+    print(f"Python {sys.version.split()[0]}, torch {th.__version__}, {th.get_num_threads()} threads")
     compare_updates(args.batch_size, args.rounds)
     compare_advantages(args.batch_size, 20)
     if args.memory:

@@ -7,6 +7,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.nn import functional as F
 
 from sb3_gae.batch import in_chunks
+from sb3_gae.errors import NumericalError
 from sb3_gae.rollout_buffer import GAERolloutBuffer
 from sb3_gae.value_step import ValueFitRecord, value_scale
 
@@ -25,6 +26,7 @@ def adam_fit(
     :param n_epochs: passes over the rollout
     :param batch_size: samples of a minibatch
     :return: values before and after, and no trust-region steps
+    :raises NumericalError: if a gradient is not finite; earlier minibatches have moved the parameters then
     """
     scale = value_scale(policy)
 
@@ -36,6 +38,8 @@ def adam_fit(
         for samples in rollout_buffer.get(batch_size):
             errors = (policy.predict_values(samples.observations).flatten() - samples.returns) / scale
             gradients = th.autograd.grad(F.mse_loss(errors, th.zeros_like(errors)), parameters)
+            if not all(th.isfinite(gradient).all() for gradient in gradients):
+                raise NumericalError("A gradient of the value function contains NaN or infinity.")
             policy.optimizer.zero_grad()
             for parameter, gradient in zip(parameters, gradients, strict=True):
                 parameter.grad = gradient

@@ -78,13 +78,14 @@ def standardized(advantages: th.Tensor) -> th.Tensor:
     :param advantages: shape (B,)
     :return: shape (B,); zeros if all are the same
     """
-    wide = advantages.double()
+    # On the CPU, since not every device has doubles
+    wide = advantages.cpu().double()
     centred = wide - wide.mean()
     deviation = centred.std()
     # A deviation that is only rounding must not be blown up to 1
     if deviation <= th.finfo(advantages.dtype).eps * wide.abs().max():
         return th.zeros_like(advantages)
-    return (centred / deviation).to(advantages.dtype)
+    return (centred / deviation).to(advantages)
 
 
 def random_subset(n_samples: int, at_most: int | None, device: th.device) -> th.Tensor | None:

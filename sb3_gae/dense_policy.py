@@ -70,10 +70,8 @@ def _policy_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
 
 def _value_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
     head = policy.value_net
-    # A head that does more than scale stays as it is, and so is refused
-    if type(head) is ValueHead and not head._forward_hooks and not head._forward_pre_hooks:
-        head = head.unscaled()
-    return _layers(policy, "value_net", head)
+    # A subclass may do more than scale: it stays as it is, and so is refused
+    return _layers(policy, "value_net", head.unscaled() if type(head) is ValueHead else head)
 
 
 def _layers(policy: ActorCriticPolicy, body: str, head: nn.Module) -> list[nn.Module]:
@@ -87,8 +85,9 @@ def _hold_exactly(layers: Sequence[nn.Module], others: Sequence[th.Tensor], para
 
 
 def _inherits(policy: ActorCriticPolicy, *methods: str) -> bool:
-    """Whether the class leaves these methods as SB3 wrote them."""
-    return all(getattr(type(policy), method) is getattr(ActorCriticPolicy, method) for method in methods)
+    """Whether the policy leaves these methods as SB3 wrote them, and no hook changes what a module returns."""
+    hooked = any(module._forward_hooks or module._forward_pre_hooks for module in policy.modules())
+    return not hooked and all(getattr(type(policy), method) is getattr(ActorCriticPolicy, method) for method in methods)
 
 
 def _features(policy: ActorCriticPolicy, observations: PyTorchObs, extractor: BaseFeaturesExtractor) -> th.Tensor:

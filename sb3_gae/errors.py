@@ -6,5 +6,5 @@ class NumericalError(ValueError):
     A number that must be finite is not, or a computation on it broke down.
 
     It is a ``ValueError`` because rl-zoo3 prunes an Optuna trial on that and lets anything else end the study.
-    Whenever it is raised, no parameter of the policy has moved since the last completed step.
+    Whenever training raises it, policy and optimiser are as they were after the last completed update.
     """

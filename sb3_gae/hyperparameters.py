@@ -64,6 +64,8 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
     check_choice("vf_optimizer", values["vf_optimizer"], ("trust_region", "adam"))
     _check_batch(values["n_steps"], values["n_envs"], values["sub_sampling_factor"])
     _check_buffer_class(values["rollout_buffer_class"])
+    if "value_lambda" in values["rollout_buffer_kwargs"]:
+        raise ValueError("Pass `value_lambda` to TRPOGAE itself and not in `rollout_buffer_kwargs`.")
 
 
 def _check_batch(n_steps: int, n_envs: int, sub_sampling_factor: int) -> None:

@@ -56,7 +56,7 @@ def policy_step(
 
 
 @dataclass
-class _Trial:
+class _SurrogateAndDivergence:
     """Surrogate and mean KL divergence of the policy as it now is, from the policy as it was."""
 
     policy: ActorCriticPolicy
@@ -99,7 +99,7 @@ def _autograd_problem(
         objective=surrogate.item(),
         gradient=flat_gradient(surrogate, parameters),
         curvature=autograd_fisher_product(policy, parameters, curvature_batch.observations),
-        evaluate=_Trial(policy, batch, advantages, old, old_log_prob),
+        evaluate=_SurrogateAndDivergence(policy, batch, advantages, old, old_log_prob),
     )
 
 
@@ -127,7 +127,7 @@ def _dense_problem(
         gradient=th.cat([network.vjp(cotangents), *log_std_gradient]),
         curvature=fisher.product,
         precondition=fisher.precondition if fisher.prepare(curvature_batch.actions) else None,
-        evaluate=_Trial(policy, batch, advantages, old, old_log_prob),
+        evaluate=_SurrogateAndDivergence(policy, batch, advantages, old, old_log_prob),
     )
 
 

@@ -28,13 +28,14 @@ def check_saved_file(path: str | pathlib.Path | io.BufferedIOBase, own: bool = T
     :raises FileNotFoundError: if there is none
     """
     file = open_path(path, "r", verbose=0, suffix="zip")
+    position = file.tell()
     try:
         names = _data_names(file)
     except _DAMAGE as error:
         raise ValueError(f"{path} is damaged, or is not a model that SB3 saved: {error}") from error
     finally:
         if file is path:
-            file.seek(0)
+            file.seek(position)
         else:
             file.close()
     if own and _MARK not in names:

@@ -3,6 +3,8 @@
 import copy
 import io
 import pathlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -207,6 +209,9 @@ class TRPOGAE(OnPolicyAlgorithm):
         if not any(parameter.requires_grad for parameter in self.policy.parameters()):
             raise ValueError("The policy has no trainable parameters; give it layers, or unfreeze them.")
 
+    def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
+        super()._maybe_recommend_cpu(mlp_class_name)
+
     def collect_rollouts(  # type: ignore[override]
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: GAERolloutBuffer, n_rollout_steps: int
     ) -> bool:
@@ -269,7 +274,7 @@ class TRPOGAE(OnPolicyAlgorithm):
         """Values, advantages and targets of a full buffer, all with the value function of this iteration."""
         rollout_buffer.gamma, rollout_buffer.gae_lambda = self.gamma, self.gae_lambda
         rollout_buffer.value_lambda = self.value_lambda
-        if (head := self._value_head()) is not None:
+        if (head := self._value_head()) is not None and head.n_batches == 0:
             head.initialize_scale(rollout_buffer.to_torch(reward_returns(rollout_buffer)))
         last_values = evaluate_rollout(self.policy, rollout_buffer, terminal, last_obs)
         rollout_buffer.compute_returns_and_advantage(last_values, last_dones)
@@ -288,7 +293,9 @@ class TRPOGAE(OnPolicyAlgorithm):
         The paper's reason (section 5): a value function fitted first would overfit the batch, and take the
         residuals and with them the policy's gradient towards zero.
 
-        :raises NumericalError: if the linear algebra of a step breaks down; the parameters of that step have not moved
+        If anything goes wrong, policy and optimiser are left as they were before the call.
+
+        :raises NumericalError: if a gradient or a curvature product is not finite, or the linear algebra breaks down
         """
         # Evaluation mode: the line search must compare one function, and batch statistics would move at each trial
         self.policy.set_training_mode(False)
@@ -298,11 +305,9 @@ class TRPOGAE(OnPolicyAlgorithm):
         of_value = value_parameters(self.policy, batch, of_policy)
         if not of_policy:
             raise ValueError("The action distribution depends on no trainable parameter; give the policy layers.")
-        try:
+        with _all_or_nothing(self.policy):
             policy_record = self._step_policy(batch, of_policy)
             value_record = self._fit_value(batch, of_value)
-        except (th.linalg.LinAlgError, ArithmeticError) as error:
-            raise NumericalError(f"The linear algebra of the update broke down: {error}") from error
         self._n_updates += 1
         self._log_update(policy_record, value_record)
 
@@ -325,7 +330,8 @@ class TRPOGAE(OnPolicyAlgorithm):
     def _fit_value(self, batch: TrainingBatch, parameters: list[th.Tensor]) -> ValueFitRecord:
         head = self._value_head()
         # A head that is frozen, or that the policy depends on as well, keeps its bits
-        if head is not None and any(parameter is head.weight for parameter in parameters):
+        movable = {id(parameter) for parameter in parameters}
+        if head is not None and all(id(parameter) in movable for parameter in head.parameters()):
             head.update_scale(batch.value_targets)
         if self.vf_optimizer == "adam":
             return adam_fit(self.policy, parameters, self.rollout_buffer, self.n_critic_updates, self.batch_size)
@@ -342,8 +348,7 @@ class TRPOGAE(OnPolicyAlgorithm):
         return value_steps(self.policy, parameters, batch, settings, self.vf_steps, curvature_subset)
 
     def _log_update(self, policy_record: StepRecord, value_record: ValueFitRecord) -> None:
-        returns = self.rollout_buffer.returns.reshape(-1)
-        for name, value in update_summary(policy_record, value_record, returns).items():
+        for name, value in update_summary(policy_record, value_record, self.rollout_buffer).items():
             self.logger.record(f"train/{name}", value)
         if (head := self._value_head()) is not None:
             self.logger.record("train/value_scale", head.scale.item())
@@ -396,3 +401,17 @@ class TRPOGAE(OnPolicyAlgorithm):
         """
         check_saved_file(path)
         return super().load(path, env, *args, **kwargs)
+
+
+@contextmanager
+def _all_or_nothing(policy: ActorCriticPolicy) -> Iterator[None]:
+    """Undo what was done to policy and optimiser if the block does not reach its end."""
+    before = copy.deepcopy((policy.state_dict(), policy.optimizer.state_dict()))
+    try:
+        yield
+    except BaseException as error:
+        policy.load_state_dict(before[0])
+        policy.optimizer.load_state_dict(before[1])
+        if isinstance(error, th.linalg.LinAlgError | ArithmeticError):
+            raise NumericalError(f"The linear algebra of the update broke down: {error}") from error
+        raise

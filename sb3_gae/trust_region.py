@@ -47,7 +47,7 @@ class TrustRegionSettings:
     :param cg_max_steps: largest number of curvature products for the direction
     :param cg_damping: multiple of the identity that is added to the curvature while solving for the direction
     :param cg_progress_tolerance: the solver ends when a product brings less than this part of what all have brought
-    :param shrinking_factor: each further trial is this times as long
+    :param shrinking_factor: each further trial is this times as long; the second may be longer, see ``_shortening``
     :param max_trials: number of lengths that are tried
     :param max_scale: longest step as a multiple of the solution of the linear system; 1 for an objective
         whose own curvature is the metric, as in least squares, where more would pass the minimum
@@ -72,6 +72,7 @@ class StepRecord:
     :param objective_after: at the end
     :param divergence: from the start to the end
     :param trials: number of lengths tried
+    :param length: of the step that was taken, as a part of the first one tried
     :param cg_status: how the solver ended
     :param cg_steps: curvature products that entered the direction
     """
@@ -81,6 +82,7 @@ class StepRecord:
     objective_after: float
     divergence: float
     trials: int
+    length: float
     cg_status: CGStatus
     cg_steps: int
 
@@ -123,7 +125,7 @@ def _radius_scale(solved: CGResult, settings: TrustRegionSettings) -> float:
     :math:`H` is without the damping: that belongs to the solver, not to the constraint.
     """
     # In double precision: the squares of a solution of 1e-30 or 1e30 would leave the range of single precision
-    solution, product = solved.solution.double(), solved.product.double()
+    solution, product = solved.solution.cpu().double(), solved.product.cpu().double()
     curvature = float(solution.dot(product - settings.cg_damping * solution))
     if not curvature > 0.0:
         return 0.0
@@ -133,15 +135,19 @@ def _radius_scale(solved: CGResult, settings: TrustRegionSettings) -> float:
 def _line_search(problem: LocalProblem, settings: TrustRegionSettings, step: th.Tensor, solved: CGResult) -> StepRecord:
     """Try ever shorter steps until one increases the objective within the radius."""
     origin = flatten(problem.parameters)
-    accepted = False
+    accepted, length = False, 1.0
     try:
         for trial in range(settings.max_trials):
-            assign(problem.parameters, origin + settings.shrinking_factor**trial * step)
+            assign(problem.parameters, origin + length * step)
             objective, divergence = problem.evaluate()
             # NaN compares false and so is rejected
-            accepted = divergence <= settings.radius and objective > problem.objective
+            improved = math.isfinite(objective) and objective > problem.objective
+            accepted = improved and divergence <= settings.radius
             if accepted:
-                return StepRecord(True, problem.objective, objective, divergence, trial + 1, solved.status, solved.steps)
+                return StepRecord(
+                    True, problem.objective, objective, divergence, trial + 1, length, solved.status, solved.steps
+                )
+            length *= _shortening(settings, divergence) if improved and trial == 0 else settings.shrinking_factor
     finally:
         # Also when a trial raises or is interrupted: nobody gets to see parameters that were only tried
         if not accepted:
@@ -149,5 +155,14 @@ def _line_search(problem: LocalProblem, settings: TrustRegionSettings, step: th.
     return _rejected(problem, solved, trials=settings.max_trials)
 
 
+def _shortening(settings: TrustRegionSettings, divergence: float) -> float:
+    """
+    How to shorten a good step that is only too long. The divergence is all but quadratic in the length, so a step that
+    overshoots by a little need not lose a fifth of its length.
+    """
+    to_radius = 0.99 * math.sqrt(settings.radius / divergence) if math.isfinite(divergence) else 0.0
+    return max(settings.shrinking_factor, to_radius)
+
+
 def _rejected(problem: LocalProblem, solved: CGResult, trials: int) -> StepRecord:
-    return StepRecord(False, problem.objective, problem.objective, 0.0, trials, solved.status, solved.steps)
+    return StepRecord(False, problem.objective, problem.objective, 0.0, trials, 0.0, solved.status, solved.steps)

@@ -3,19 +3,23 @@
 import numpy as np
 
 from sb3_gae.diagnostics import explained_variance
+from sb3_gae.rollout_buffer import GAERolloutBuffer
 from sb3_gae.trust_region import StepRecord
 from sb3_gae.value_step import ValueFitRecord
 
 
-def update_summary(policy_record: StepRecord, value_record: ValueFitRecord, returns: np.ndarray) -> dict[str, float]:
+def update_summary(
+    policy_record: StepRecord, value_record: ValueFitRecord, rollout_buffer: GAERolloutBuffer
+) -> dict[str, float]:
     """
     :param policy_record: of the policy step
     :param value_record: of the value fit
-    :param returns: its targets, shape (B,)
+    :param rollout_buffer: what the update used
     :return: sb3-contrib's names where it has one; the ``vf_`` entries only after trust-region steps
     """
     # Double precision: squares of values around 1e30 leave the range of single
-    before, after = value_record.values_before.cpu().double().numpy(), value_record.values_after.cpu().double().numpy()
+    collected, returns = (array.reshape(-1).astype(np.float64) for array in (rollout_buffer.values, rollout_buffer.returns))
+    after = value_record.values_after.cpu().double().numpy()
     summary = {
         "policy_objective": policy_record.objective_after,
         "kl_divergence_loss": policy_record.divergence,
@@ -23,7 +27,7 @@ def update_summary(policy_record: StepRecord, value_record: ValueFitRecord, retu
         "line_search_trials": policy_record.trials,
         "cg_steps": policy_record.cg_steps,
         "value_loss": float(np.mean(np.square(after - returns))),
-        "explained_variance": explained_variance(before, returns),
+        "explained_variance": explained_variance(collected, returns),
         "explained_variance_after": explained_variance(after, returns),
     }
     if value_record.steps:

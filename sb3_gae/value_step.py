@@ -9,7 +9,7 @@ exceed the radius. All quantities here are divided by :math:`\sigma^2`: the obje
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch as th
@@ -80,6 +80,7 @@ def value_steps(
     make_model = _DenseValues if has_dense_value(policy, parameters) else _AutogradValues
     scale = value_scale(policy)
     fit = _Fit(make_model(policy, parameters, batch.observations, observations), batch.value_targets / scale)
+    settings = replace(settings, cg_damping=settings.cg_damping / fit.target_square)
     before, records = fit.values, []
     for _ in range(n_steps if parameters else 0):
         if fit.variance == 0.0:
@@ -110,11 +111,11 @@ class _Values(Protocol):
     def vjp(self, cotangents: th.Tensor) -> th.Tensor:
         """Jacobian's transpose at the parameters of the last :meth:`values`, times ``cotangents`` (B,), shape (n,)."""
 
-    def gauss_newton_product(self) -> CurvatureProduct:
-        """Products with the mean of the Jacobian's outer products over the curvature's samples, at the same parameters."""
-
-    def preconditioner(self) -> KroneckerPreconditioner | None:
-        """About the inverse of that matrix, after :meth:`gauss_newton_product`; None if it is not known."""
+    def curvature(self) -> tuple[CurvatureProduct, KroneckerPreconditioner | None]:
+        """
+        Products with the mean of the Jacobian's outer products over the curvature's samples, at the same parameters,
+        and about the inverse of that matrix where it is known.
+        """
 
 
 class _DenseValues:
@@ -139,17 +140,17 @@ class _DenseValues:
     def vjp(self, cotangents: th.Tensor) -> th.Tensor:
         return self._network.vjp(cotangents[:, None])
 
-    def gauss_newton_product(self) -> CurvatureProduct:
+    def curvature(self) -> tuple[CurvatureProduct, KroneckerPreconditioner | None]:
         network = self._curvature_network
         if network is not self._network:
             network.forward()
-        return lambda vector: network.gauss_newton_product(vector, lambda tangents, rows: tangents) / network.batch_size
 
-    def preconditioner(self) -> KroneckerPreconditioner | None:
-        network = self._curvature_network
+        def product(vector: th.Tensor) -> th.Tensor:
+            return network.gauss_newton_product(vector, lambda tangents, rows: tangents) / network.batch_size
+
         if not KroneckerPreconditioner.suits(network):
-            return None
-        return KroneckerPreconditioner(network, self.parameters[0].new_ones(network.batch_size, 1))
+            return product, None
+        return product, KroneckerPreconditioner(network, self.parameters[0].new_ones(network.batch_size, 1))
 
 
 class _AutogradValues:
@@ -173,12 +174,9 @@ class _AutogradValues:
     def vjp(self, cotangents: th.Tensor) -> th.Tensor:
         return flat_gradient(self._predict(self._observations).dot(cotangents), self.parameters)
 
-    def gauss_newton_product(self) -> CurvatureProduct:
+    def curvature(self) -> tuple[CurvatureProduct, KroneckerPreconditioner | None]:
         values = self._predict(self._curvature_observations)
-        return hessian_product(0.5 * (values - values.detach()).square().mean(), self.parameters)
-
-    def preconditioner(self) -> KroneckerPreconditioner | None:
-        return None
+        return hessian_product(0.5 * (values - values.detach()).square().mean(), self.parameters), None
 
     def _predict(self, observations: PyTorchObs) -> th.Tensor:
         return self._policy.predict_values(observations).squeeze(1) / value_scale(self._policy)
@@ -191,6 +189,15 @@ class _Fit:
         self._model = model
         self._targets = targets
         self.values = model.values()
+
+    @property
+    def target_square(self) -> float:
+        """
+        Mean square of the targets, in the network's units: about 1 with a :class:`ValueHead` that keeps to the returns.
+
+        The curvature over the variance shrinks with its inverse, and what is added to the diagonal must follow.
+        """
+        return self._targets.cpu().double().square().mean().item() or 1.0
 
     @property
     def variance(self) -> float:
@@ -207,12 +214,12 @@ class _Fit:
 
     def _local_problem(self) -> LocalProblem:
         old_values, variance = self.values, self.variance
-        product, preconditioner = self._model.gauss_newton_product(), self._model.preconditioner()
+        product, preconditioner = self._model.curvature()
 
         def evaluate() -> tuple[float, float]:
             self.values = self._model.values()
-            divergence = 0.5 * (self.values - old_values).square().mean().item() / variance
-            return -0.5 * self.variance / variance, divergence
+            new_variance, change = self.variance, (self.values - old_values).square().mean().item()
+            return -0.5 * new_variance / variance, 0.5 * change / variance
 
         return LocalProblem(
             name="value function",

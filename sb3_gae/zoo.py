@@ -176,7 +176,7 @@ def sample_trpo_gae_params(
 
     :param trial: the trial to sample for
     :param n_actions: number of continuous actions, 0 where actions are discrete
-    :param n_envs: number of environments; batches are 512 to 8192 transitions whatever it is
+    :param n_envs: number of environments; batches are about 512 to 8192 transitions whatever it is
     :param additional_args: what off-policy algorithms need, unused
     :return: keyword arguments of TRPOGAE
     """

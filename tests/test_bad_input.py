@@ -384,5 +384,11 @@ def test_unbounded_actions_are_refused() -> None:
 
 def test_settings_that_are_changed_later_are_those_that_count() -> None:
     model = small_model()
-    model.target_kl = 1e-5
+    model.target_kl, model.gamma, model.gae_lambda, model.value_lambda = 1e-5, 0.0, 0.0, 1.0
     assert 0.0 < train_once(model)["train/kl_divergence_loss"] <= 1e-5
+    buffer = model.rollout_buffer
+    np.testing.assert_allclose(buffer.advantages, buffer.rewards - buffer.values, atol=1e-6)
+    np.testing.assert_allclose(buffer.returns, buffer.rewards, atol=1e-6)
+    model.gamma, model.gae_lambda = 0.9, 0.0
+    train_once(model)
+    assert np.abs(buffer.returns - buffer.advantages - buffer.values).max() > 1e-2, "targets have a lambda of their own"

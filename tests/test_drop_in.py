@@ -77,8 +77,15 @@ def test_every_argument_of_contrib_is_read_and_kept(tmp_path: Any) -> None:
 
 
 def test_buffer_arguments_reach_the_buffer() -> None:
-    model = TRPOGAE("MlpPolicy", vec_env(), n_steps=8, rollout_buffer_kwargs={"value_lambda": 0.3}, policy_kwargs=SMALL)
-    assert model.rollout_buffer.value_lambda == 0.3
+    class Labelled(GAERolloutBuffer):
+        def __init__(self, *args: Any, label: str, **kwargs: Any):
+            super().__init__(*args, **kwargs)
+            self.label = label
+
+    buffer: dict[str, Any] = {"rollout_buffer_class": Labelled, "rollout_buffer_kwargs": {"label": "mine"}}
+    model = TRPOGAE("MlpPolicy", vec_env(), n_steps=8, policy_kwargs=SMALL, **buffer)
+    train_once(model)
+    assert isinstance(model.rollout_buffer, Labelled) and model.rollout_buffer.label == "mine"
 
 
 @pytest.mark.parametrize(

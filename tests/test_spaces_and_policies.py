@@ -25,6 +25,7 @@ from torch import nn
 
 import sb3_gae.trpo_gae
 from sb3_gae import TRPOGAE, MlpPolicy
+from sb3_gae.collection import training_batch
 from sb3_gae.policy_step import policy_parameters
 from sb3_gae.value_head import ValueHead
 from sb3_gae.value_step import value_parameters
@@ -350,7 +351,7 @@ def test_the_policy_step_leaves_the_value_function_alone_unless_they_share_layer
 def groups(model: TRPOGAE) -> tuple[set[str], set[str]]:
     """Names of the parameters of the policy step, and of the value step."""
     train_once(model)
-    batch = model._training_batch()
+    batch = training_batch(model.rollout_buffer, model.action_space)
     of_policy = policy_parameters(model.policy, batch)
     of_value = value_parameters(model.policy, batch, of_policy)
     names = {id(parameter): name for name, parameter in model.policy.named_parameters()}

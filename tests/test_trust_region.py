@@ -174,8 +174,18 @@ def test_a_divergence_over_the_radius_is_rejected_and_on_it_accepted() -> None:
         assert trust_region_step(problem, EXACT).trials == trials
 
 
+@pytest.mark.parametrize(("excess", "second"), [(1.05, 0.99 / math.sqrt(1.05)), (4.0, 0.8), (math.inf, 0.8)])
+def test_a_step_that_is_only_a_little_too_long_is_shortened_to_just_within_the_radius(excess: float, second: float) -> None:
+    quadratic = Quadratic()
+    divergences = iter([excess * EXACT.radius, 2 * EXACT.radius, 0.0])
+    problem = quadratic.problem(evaluate=lambda: (quadratic.evaluate()[0], next(divergences)))
+    record = trust_region_step(problem, replace(EXACT, shrinking_factor=0.8))
+    assert (record.trials, record.length) == (3, pytest.approx(0.8 * second))
+    th.testing.assert_close(quadratic.moved(), 0.8 * second * quadratic.trials[0], rtol=1e-9, atol=1e-12)
+
+
 def test_an_objective_that_does_not_rise_is_rejected() -> None:
-    for objective in (7.0, 6.0, -math.inf):
+    for objective in (7.0, 6.0, -math.inf, math.inf):
         quadratic = Quadratic()
         record = trust_region_step(quadratic.problem(evaluate=lambda: (objective, 0.0)), EXACT)  # noqa: B023
         assert not record.accepted
@@ -196,7 +206,7 @@ def test_a_failed_search_restores_every_bit_and_records_that_nothing_happened() 
     assign(quadratic.parameters, th.tensor([0.1, 1e-300, 1e300, -0.3, 5e-324, -0.0], dtype=th.float64))
     before = [parameter.clone() for parameter in quadratic.parameters]
     record = trust_region_step(quadratic.problem(evaluate=lambda: (6.0, 0.5)), replace(EXACT, max_trials=4))
-    assert record == StepRecord(False, 7.0, 7.0, 0.0, 4, CGStatus.CONVERGED, record.cg_steps)
+    assert record == StepRecord(False, 7.0, 7.0, 0.0, 4, 0.0, CGStatus.CONVERGED, record.cg_steps)
     for parameter, copy in zip(quadratic.parameters, before, strict=True):
         assert th.equal(parameter, copy)
         assert th.equal(parameter.signbit(), copy.signbit())
@@ -224,7 +234,9 @@ def test_the_record_of_an_accepted_step_is_what_is_there_now() -> None:
     quadratic = Quadratic()
     record = trust_region_step(quadratic.problem(), EXACT)
     objective, divergence = quadratic.evaluate()
-    assert record == StepRecord(True, 7.0, objective, divergence, record.trials, CGStatus.CONVERGED, record.cg_steps)
+    assert record == StepRecord(
+        True, 7.0, objective, divergence, record.trials, record.length, CGStatus.CONVERGED, record.cg_steps
+    )
     assert 0.0 < divergence <= EXACT.radius
     assert objective > 7.0
     assert 1 <= record.cg_steps <= 7
@@ -240,7 +252,7 @@ def never() -> tuple[float, float]:
 def test_a_zero_gradient_moves_nothing() -> None:
     quadratic = Quadratic(scale=0.0)
     record = trust_region_step(quadratic.problem(evaluate=never), EXACT)
-    assert record == StepRecord(False, 7.0, 7.0, 0.0, 0, CGStatus.ZERO_GRADIENT, 0)
+    assert record == StepRecord(False, 7.0, 7.0, 0.0, 0, 0.0, CGStatus.ZERO_GRADIENT, 0)
     assert quadratic.untouched()
 
 
@@ -248,14 +260,14 @@ def test_a_zero_gradient_moves_nothing() -> None:
 def test_without_positive_curvature_nothing_moves(factor: float) -> None:
     quadratic = Quadratic()
     record = trust_region_step(quadratic.problem(curvature=lambda vector: factor * vector, evaluate=never), EXACT)
-    assert record == StepRecord(False, 7.0, 7.0, 0.0, 0, CGStatus.NON_POSITIVE_CURVATURE, 0)
+    assert record == StepRecord(False, 7.0, 7.0, 0.0, 0, 0.0, CGStatus.NON_POSITIVE_CURVATURE, 0)
     assert quadratic.untouched()
 
 
 def test_no_solver_steps_move_nothing() -> None:
     quadratic = Quadratic()
     record = trust_region_step(quadratic.problem(evaluate=never), replace(EXACT, cg_max_steps=0))
-    assert record == StepRecord(False, 7.0, 7.0, 0.0, 0, CGStatus.MAX_STEPS, 0)
+    assert record == StepRecord(False, 7.0, 7.0, 0.0, 0, 0.0, CGStatus.MAX_STEPS, 0)
     assert quadratic.untouched()
 
 

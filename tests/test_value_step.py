@@ -18,7 +18,7 @@ from sb3_gae.value_step import ValueFitRecord, value_parameters, value_steps
 
 BOX = ACTION_SPACES["Box"]
 EXACT = TrustRegionSettings(radius=0.05, cg_max_steps=300, cg_damping=0.0, max_scale=1.0)
-DAMPED = replace(EXACT, cg_max_steps=10, cg_damping=1e-3, radius=0.2)
+DAMPED = replace(EXACT, cg_max_steps=10, cg_damping=1e-2, radius=0.2)
 LINEAR = dict(net_arch=dict(pi=[3], vf=[]))
 
 KINDS = {
@@ -57,7 +57,7 @@ def variance_of(policy: ActorCriticPolicy, batch: TrainingBatch) -> float:
 
 def unshrunk(change: th.Tensor, fitted: ValueFitRecord) -> th.Tensor:
     """What the first trial of a single step on linear values changed, whichever trial was accepted."""
-    return change / EXACT.shrinking_factor ** (fitted.steps[0].trials - 1)
+    return change / fitted.steps[0].length
 
 
 # --- The constraint, and its units ---
@@ -173,12 +173,12 @@ def test_linear_values_reach_the_least_squares_solution_in_one_step(
 def test_steps_are_those_of_dense_matrices(kwargs: dict, radius: float) -> None:
     policy = double_policy(BOX, **kwargs)
     policy.value_net.scale.fill_(2.0)
-    batch, settings = training_batch(policy), replace(EXACT, radius=radius, cg_damping=0.05)
+    batch, settings = training_batch(policy), replace(EXACT, radius=radius, cg_damping=0.5)
     parameters = value_parameters_of(policy, batch)
     expected, before = dense_step(policy, batch, parameters, settings), flatten(parameters)
     (record,) = fit(policy, batch, settings).steps
     assert record.accepted
-    expected *= settings.shrinking_factor ** (record.trials - 1)
+    expected *= record.length
     th.testing.assert_close(flatten(parameters) - before, expected, rtol=1e-4, atol=1e-6)
 
 
@@ -191,7 +191,7 @@ def test_curvature_may_come_from_a_subset_while_the_gradient_sees_everything() -
     assert not th.allclose(expected, dense_step(policy, batch, parameters, settings), rtol=0.01)
     (record,) = fit(policy, batch, settings, subset=subset).steps
     assert record.accepted
-    expected *= settings.shrinking_factor ** (record.trials - 1)
+    expected *= record.length
     th.testing.assert_close(flatten(parameters) - before, expected, rtol=1e-4, atol=1e-6)
 
 
@@ -210,7 +210,9 @@ def dense_step(
     gradient = rows.t() @ errors / len(batch) / variance
     curvature_rows = rows if subset is None else rows[subset]
     hessian = curvature_rows.t() @ curvature_rows / len(curvature_rows) / variance
-    step = th.linalg.solve(hessian + settings.cg_damping * th.eye(len(hessian), dtype=th.float64), gradient)
+    # The damping is meant for targets of mean square 1
+    damping = settings.cg_damping / (batch.value_targets / scale).square().mean()
+    step = th.linalg.solve(hessian + damping * th.eye(len(hessian), dtype=th.float64), gradient)
     return step * min(1.0, math.sqrt(2.0 * settings.radius / step.dot(hessian @ step).item()))
 
 
@@ -219,7 +221,7 @@ def test_dense_and_autograd_steps_are_the_same(kwargs: dict, monkeypatch: pytest
     policies = [double_policy(BOX, **kwargs), double_policy(BOX, **kwargs)]
     batch = training_batch(policies[0])
     # Solved to the end: on the way there the two may differ, by a preconditioner that only one of them has
-    settings = replace(DAMPED, cg_max_steps=300, cg_damping=0.05)
+    settings = replace(DAMPED, cg_max_steps=300, cg_damping=1.0)
     fast = fit(policies[0], batch, settings, n_steps=3)
     monkeypatch.setattr(value_step, "has_dense_value", lambda policy, parameters: False)
     slow = fit(policies[1], batch, settings, n_steps=3)
@@ -357,3 +359,16 @@ def test_a_subset_of_everything_is_everything() -> None:
     assert th.equal(take(batch.observations, everything), batch.observations)
     fitted = [fit(policy, batch, DAMPED, 2, subset) for policy, subset in zip(policies, (None, everything), strict=True)]
     th.testing.assert_close(fitted[0].values_after, fitted[1].values_after, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("reward_scale", [1.0, 1e3])
+def test_a_policy_whose_values_have_no_scale_of_their_own_learns_whatever_the_unit_of_the_reward(reward_scale: float) -> None:
+    th.manual_seed(0)
+    policy = ActorCriticPolicy(BOX, BOX, lambda _: 0.0)
+    observations = th.randn(500, *BOX.shape)
+    signal = observations.flatten(1)[:, 0]
+    batch = TrainingBatch(observations, th.zeros(500, *BOX.shape), signal, reward_scale * signal)
+    settings = TrustRegionSettings(radius=0.2, cg_max_steps=10, cg_damping=1e-2, cg_progress_tolerance=0.1, max_scale=1.0)
+    for _ in range(8):
+        fitted = fit(policy, batch, settings, n_steps=5)
+    assert explained_variance(fitted.values_after.numpy(), batch.value_targets.numpy()) > 0.9
