@@ -113,6 +113,12 @@ def state_of(module: th.nn.Module) -> dict[str, th.Tensor]:
     return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}
 
 
+def optimizer_state(model: OnPolicyAlgorithm) -> dict[str, th.Tensor]:
+    """A copy of what the optimiser remembers."""
+    state = model.policy.optimizer.state_dict()["state"]
+    return {f"{name} {part}": tensor.clone() for name, parts in state.items() for part, tensor in parts.items()}
+
+
 def differing(before: dict[str, th.Tensor], after: dict[str, th.Tensor]) -> list[str]:
     """Names of the tensors that are not the same bit for bit."""
     assert before.keys() == after.keys()

@@ -14,6 +14,7 @@ from envs_for_tests import (
     AnySpacesEnv,
     BadNumberEnv,
     differing,
+    optimizer_state,
     state_of,
     train_once,
     vec_env,
@@ -231,20 +232,54 @@ def test_a_bad_curvature_of_the_policy_is_refused(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("what", ["gradient", "curvature product"])
-def test_a_bad_value_step_is_refused_and_leaves_the_values_as_they_were(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bad_value_step_is_refused_and_undoes_the_policy_step_before_it(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     model = small_model()
     train_once(model)
     if what == "gradient":
         spoil(monkeypatch, sb3_gae.value_step, gradient=lambda gradient: gradient * math.inf)
     else:
         spoil(monkeypatch, sb3_gae.value_step, curvature=lambda product: lambda vector: product(vector) * math.nan)
-    body = state_of(model.policy.mlp_extractor.value_net)
-    with pytest.raises(NumericalError, match=f"{what} of the value function contains NaN or infinity"):
+    check_refused(model, f"{what} of the value function contains NaN or infinity")
+
+
+def test_a_bad_gradient_of_adam_is_refused_and_undoes_the_policy_step_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = small_model(vf_optimizer="adam", batch_size=4)
+    train_once(model)
+    optimizer = optimizer_state(model)
+    losses = []
+
+    def third_is_bad(*args: Any, **kwargs: Any) -> th.Tensor:
+        losses.append(real(*args, **kwargs))
+        return losses[-1] * (math.nan if len(losses) == 3 else 1.0)
+
+    real = th.nn.functional.mse_loss
+    monkeypatch.setattr(th.nn.functional, "mse_loss", third_is_bad)
+    check_refused(model, "gradient of the value function contains NaN or infinity")
+    assert len(losses) == 3
+    assert differing(optimizer, optimizer_state(model)) == []
+
+
+@pytest.mark.parametrize("vf_optimizer", ["trust_region", "adam"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_update_that_is_interrupted_is_undone(error: type[BaseException], vf_optimizer: str) -> None:
+    model = small_model(vf_optimizer=vf_optimizer)
+    train_once(model)
+    fit_value, before, optimizer = model._fit_value, state_of(model.policy), optimizer_state(model)
+    moved = []
+
+    def interrupted(*args: Any) -> None:
+        fit_value(*args)
+        moved.extend(differing(before, state_of(model.policy)))
+        raise error
+
+    model._fit_value = interrupted  # type: ignore[method-assign, assignment]
+    with pytest.raises(error):
         train_once(model)
-    assert differing(body, state_of(model.policy.mlp_extractor.value_net)) == []
-    # The last layer is rescaled by then, which the values do not notice
-    values = model.policy.predict_values(model.rollout_buffer.batch().observations).detach().numpy()
-    np.testing.assert_allclose(values.flatten(), model.rollout_buffer.values.flatten(), rtol=1e-5)
+    assert {"action_net.weight", "value_net.weight"} <= set(moved)
+    assert differing(before, state_of(model.policy)) == []
+    assert differing(optimizer, optimizer_state(model)) == []
+    model._fit_value = fit_value  # type: ignore[method-assign]
+    assert train_once(model)["train/n_updates"] == 2
 
 
 @pytest.mark.parametrize("error", [th.linalg.LinAlgError, ZeroDivisionError, OverflowError])

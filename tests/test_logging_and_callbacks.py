@@ -384,7 +384,8 @@ def test_a_value_search_that_fails_restores_the_values_and_logs_that_nothing_was
     before = state_of(model.policy)
     logged = train_once(model)
     assert (logged["train/vf_steps"], logged["train/vf_kl_divergence"]) == (0, 0.0)
-    assert logged["train/explained_variance_after"] == logged["train/explained_variance"]
+    # One from the rollout's own values, the other from those of the fit: the same function, added up in another order
+    assert logged["train/explained_variance_after"] == pytest.approx(logged["train/explained_variance"], rel=1e-5)
     samples = model.rollout_buffer.batch()
     assert logged["train/value_loss"] == pytest.approx((samples.old_values - samples.returns).square().mean().item(), rel=1e-5)
     moved = differing(before, state_of(model.policy))

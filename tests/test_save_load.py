@@ -11,7 +11,17 @@ import numpy as np
 import pytest
 import sb3_contrib
 import torch as th
-from envs_for_tests import SMALL, VECTOR, AnySpacesEnv, KLProbe, differing, state_of, train_once, vec_env
+from envs_for_tests import (
+    SMALL,
+    VECTOR,
+    AnySpacesEnv,
+    KLProbe,
+    differing,
+    optimizer_state,
+    state_of,
+    train_once,
+    vec_env,
+)
 from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -299,11 +309,6 @@ def mismatches() -> dict[str, dict[str, Any]]:
         "another optimiser": good | {"policy.optimizer": one_group_more},
         "numbers instead of tensors": good | {"policy": dict.fromkeys(policy, 0.0)},
     }
-
-
-def optimizer_state(model: TRPOGAE) -> dict[str, th.Tensor]:
-    state = model.policy.optimizer.state_dict()["state"]
-    return {f"{name} {part}": tensor.clone() for name, parts in state.items() for part, tensor in parts.items()}
 
 
 @pytest.mark.parametrize("what", mismatches())
