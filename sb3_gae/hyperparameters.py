@@ -30,13 +30,27 @@ FOREIGN_ARGUMENTS: dict[str, str] = {
 }
 
 
-def warn_of_unused(passed: Mapping[str, Any], advice: Mapping[str, str]) -> None:
+def warn_of_unused(adam_arguments: Mapping[str, Any], vf_optimizer: str, foreign_arguments: Mapping[str, Any]) -> None:
     """
-    :param passed: arguments that the user gave
-    :param advice: names that have no effect, and what to do instead
+    Say of each argument without effect what to use instead.
+
+    :param adam_arguments: values of those in :data:`ADAM_ARGUMENTS`, None where the user gave none
+    :param vf_optimizer: whether Adam is used
+    :param foreign_arguments: what the user passed beyond the signature
+    :raises TypeError: if an argument is not even another algorithm's
     """
-    for name in passed:
-        warnings.warn(f"`{name}` has no effect here: {advice[name]}.", UserWarning, stacklevel=4)
+    for name in foreign_arguments:
+        if name not in FOREIGN_ARGUMENTS:
+            raise TypeError(f"TRPOGAE.__init__() got an unexpected keyword argument {name!r}")
+        _warn(name, FOREIGN_ARGUMENTS[name])
+    for name, value in adam_arguments.items():
+        if value is not None and vf_optimizer == "trust_region":
+            _warn(name, ADAM_ARGUMENTS[name])
+
+
+def _warn(name: str, advice: str) -> None:
+    # Point to the line that constructs the algorithm
+    warnings.warn(f"`{name}` has no effect here: {advice}.", UserWarning, stacklevel=4)
 
 
 def check_hyperparameters(values: Mapping[str, Any]) -> None:

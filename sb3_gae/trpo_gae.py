@@ -3,8 +3,6 @@
 import copy
 import io
 import pathlib
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -18,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gae.adam_fit import adam_fit
+from sb3_gae.all_or_nothing import all_or_nothing
 from sb3_gae.batch import TrainingBatch, random_subset, standardized
 from sb3_gae.checks import check_finite_parameters, check_finite_rollout, check_finite_step
 from sb3_gae.collection import (
@@ -30,8 +29,7 @@ from sb3_gae.collection import (
     terminal_observations,
     training_batch,
 )
-from sb3_gae.errors import NumericalError
-from sb3_gae.hyperparameters import ADAM_ARGUMENTS, FOREIGN_ARGUMENTS, check_hyperparameters, warn_of_unused
+from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gae.policy_step import policy_parameters, policy_step
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
@@ -168,7 +166,7 @@ class TRPOGAE(OnPolicyAlgorithm):
             supported_action_spaces=(spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary),
         )
         adam_arguments = {"learning_rate": learning_rate, "batch_size": batch_size, "n_critic_updates": n_critic_updates}
-        self._warn_of_unused(adam_arguments, vf_optimizer, foreign_arguments)
+        warn_of_unused(adam_arguments, vf_optimizer, foreign_arguments)
         self.batch_size = 128 if batch_size is None else batch_size
         self.n_critic_updates = 10 if n_critic_updates is None else n_critic_updates
         self.cg_max_steps = cg_max_steps
@@ -189,16 +187,6 @@ class TRPOGAE(OnPolicyAlgorithm):
         self.curvature_samples = curvature_samples
         if _init_setup_model:
             self._setup_model()
-
-    @staticmethod
-    def _warn_of_unused(adam_arguments: dict[str, Any], vf_optimizer: str, foreign_arguments: dict[str, Any]) -> None:
-        for name in foreign_arguments:
-            if name not in FOREIGN_ARGUMENTS:
-                raise TypeError(f"TRPOGAE.__init__() got an unexpected keyword argument {name!r}")
-        warn_of_unused(foreign_arguments, FOREIGN_ARGUMENTS)
-        if vf_optimizer == "trust_region":
-            passed = {name: value for name, value in adam_arguments.items() if value is not None}
-            warn_of_unused(passed, ADAM_ARGUMENTS)
 
     def _setup_model(self) -> None:
         check_hyperparameters(vars(self))
@@ -305,7 +293,7 @@ class TRPOGAE(OnPolicyAlgorithm):
         of_value = value_parameters(self.policy, batch, of_policy)
         if not of_policy:
             raise ValueError("The action distribution depends on no trainable parameter; give the policy layers.")
-        with _all_or_nothing(self.policy):
+        with all_or_nothing(self.policy):
             policy_record = self._step_policy(batch, of_policy)
             value_record = self._fit_value(batch, of_value)
         self._n_updates += 1
@@ -401,17 +389,3 @@ class TRPOGAE(OnPolicyAlgorithm):
         """
         check_saved_file(path)
         return super().load(path, env, *args, **kwargs)
-
-
-@contextmanager
-def _all_or_nothing(policy: ActorCriticPolicy) -> Iterator[None]:
-    """Undo what was done to policy and optimiser if the block does not reach its end."""
-    before = copy.deepcopy((policy.state_dict(), policy.optimizer.state_dict()))
-    try:
-        yield
-    except BaseException as error:
-        policy.load_state_dict(before[0])
-        policy.optimizer.load_state_dict(before[1])
-        if isinstance(error, th.linalg.LinAlgError | ArithmeticError):
-            raise NumericalError(f"The linear algebra of the update broke down: {error}") from error
-        raise

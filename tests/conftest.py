@@ -1,5 +1,8 @@
 """Settings of all tests."""
 
+from collections.abc import Iterator
+
+import pytest
 import torch as th
 from hypothesis import settings
 
@@ -9,3 +12,11 @@ th.set_num_threads(1)
 # No deadline and no database: slow machines and read-only checkouts run the same tests
 settings.register_profile("sb3_gae", deadline=None, database=None, print_blob=True, max_examples=40)
 settings.load_profile("sb3_gae")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def sb3_logs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """SB3 makes a folder for every training that is given none."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SB3_LOGDIR", str(tmp_path_factory.mktemp("sb3")))
+        yield

@@ -136,7 +136,7 @@ def test_arguments_of_ppo_and_a2c_are_accepted_with_a_warning_that_says_what_to_
 
 def test_every_argument_of_ppo_and_a2c_is_known() -> None:
     theirs = {*inspect.signature(PPO).parameters, *inspect.signature(A2C).parameters}
-    known = {*inspect.signature(TRPOGAE).parameters, *sb3_gae.trpo_gae.FOREIGN_ARGUMENTS}
+    known = {*inspect.signature(TRPOGAE).parameters, *sb3_gae.hyperparameters.FOREIGN_ARGUMENTS}
     assert theirs <= known
 
 

@@ -33,7 +33,7 @@ from sb3_gae.value_step import value_parameters
 ACTION_SPACES = {
     "Box": spaces.Box(-1.0, 1.0, (3,), np.float32),
     "Box 2x2": spaces.Box(-1.0, 1.0, (2, 2), np.float32),
-    "Box asymmetric": spaces.Box(np.array([-3.0, 0.5]), np.array([1.0, 2.0]), dtype=np.float32),
+    "Box asymmetric": spaces.Box(np.float32([-3.0, 0.5]), np.float32([1.0, 2.0])),
     "Discrete": spaces.Discrete(4),
     "MultiDiscrete": spaces.MultiDiscrete([3, 2]),
     "MultiBinary": spaces.MultiBinary(3),
