@@ -139,7 +139,7 @@ class TRPOGAE(OnPolicyAlgorithm):
         cg_tolerance: float = 0.1,
         vf_optimizer: str = "trust_region",
         normalize_value: bool = True,
-        curvature_samples: int | None = 10_000,
+        curvature_samples: int | None = 8_192,
         **foreign_arguments: Any,
     ):
         super().__init__(
