@@ -29,7 +29,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gae import TRPOGAE, GAERolloutBuffer, MlpPolicy
-from sb3_gae.trpo_gae import FOREIGN_ARGUMENTS
+from sb3_gae.hyperparameters import FOREIGN_ARGUMENTS
 
 OBSERVATIONS = np.random.default_rng(0).uniform(-1, 1, (64, 3)).astype(np.float32)
 
