@@ -6,13 +6,17 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_gae import TRPOGAE
+
 VECTOR = spaces.Box(-1.0, 1.0, (3,), np.float32)
+CHANNEL_FIRST = spaces.Box(0, 255, (1, 36, 36), np.uint8)
 ACTIONS = spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 #: networks that take no time
@@ -156,3 +160,32 @@ class KLProbe(BaseCallback):
         new = action_distributions(self.model.policy, self.observations)
         parts = [th.distributions.kl_divergence(p, q) for p, q in zip(self.old, new, strict=True)]
         return float(sum(part.reshape(len(part), -1).sum(dim=1).mean() for part in parts))
+
+
+def policy_name(observation_space: spaces.Space) -> str:
+    if isinstance(observation_space, spaces.Dict):
+        return "MultiInputPolicy"
+    return "CnnPolicy" if observation_space.dtype == np.uint8 else "MlpPolicy"
+
+
+def small_model(env: VecEnv, policy: Any = None, **kwargs: Any) -> TRPOGAE:
+    kwargs = {"n_steps": 16, "policy_kwargs": SMALL, "seed": 0} | kwargs
+    return TRPOGAE(policy or policy_name(env.observation_space), env, **kwargs)
+
+
+def check_training(model: TRPOGAE, iterations: int = 2) -> None:
+    """Each update moves the policy, by as much as is logged and no more than allowed, and actions lie in their space."""
+    for _ in range(iterations):
+        probe = KLProbe()
+        logged = train_once(model, probe)
+        assert logged["train/is_line_search_success"] == 1.0
+        assert 0.0 < logged["train/kl_divergence_loss"] <= model.target_kl
+        assert probe.kl() == pytest.approx(logged["train/kl_divergence_loss"], rel=1e-3, abs=1e-6)
+        assert logged["train/vf_steps"] >= 1
+        assert logged["train/vf_kl_divergence"] <= model.vf_trust_region
+    assert all(tensor.isfinite().all() for tensor in model.policy.state_dict().values())
+    observations = model.get_env().reset()
+    for deterministic in (True, False):
+        actions, _ = model.predict(observations, deterministic=deterministic)
+        assert len(actions) == model.n_envs
+        assert all(model.action_space.contains(action) for action in actions)
