@@ -6,13 +6,17 @@ arXiv 1506.02438.
 """
 
 from sb3_gae.callbacks import LambdaSweepCallback
+from sb3_gae.envs import register_tasks
 from sb3_gae.errors import NumericalError
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gae.presets import CARTPOLE_NETWORKS, LOCOMOTION_NETWORKS, PAPER_VALUE_FIT
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer, LambdaSweep
 from sb3_gae.trpo_gae import TRPOGAE
+from sb3_gae.vec_env import MujocoVecEnv
 
 __version__ = "0.1.0"
+
+register_tasks()
 
 __all__ = [
     "CARTPOLE_NETWORKS",
@@ -25,6 +29,7 @@ __all__ = [
     "LambdaSweep",
     "LambdaSweepCallback",
     "MlpPolicy",
+    "MujocoVecEnv",
     "MultiInputPolicy",
     "NumericalError",
 ]

@@ -1,0 +1,110 @@
+"""The paper's 3D biped (section 6.2.2): run forward."""
+
+from pathlib import Path
+
+import numpy as np
+
+from sb3_gae.envs.mujoco_env import MujocoTaskEnv
+from sb3_gae.envs.mujoco_task import MujocoTask, PhysicsStates
+
+FEET = ("right_foot_force", "left_foot_force")
+
+
+def impact_cost(states: PhysicsStates, sensors: tuple[str, ...], largest: float) -> np.ndarray:
+    """
+    :param states: N states
+    :param sensors: names of three-dimensional forces, in newtons
+    :param largest: each component is cut to this before it is squared, in newtons
+    :return: sum of the squares, shape (N,)
+    """
+    forces = np.concatenate([states.sensors[name] for name in sensors], axis=1)
+    return np.square(np.clip(forces, -largest, largest)).sum(axis=1)
+
+
+class Biped(MujocoTask):
+    """
+    Reward :math:`v_{fwd} - 10^{-5}|u|^2 - 10^{-5}|f_{impact}|^2 + 0.2`; see :class:`GaeBipedEnv`.
+    """
+
+    def __init__(
+        self,
+        torque_cost_weight: float = 1e-5,
+        impact_cost_weight: float = 1e-5,
+        largest_impact_force: float = 1.0,
+        alive_bonus: float = 0.2,
+        lowest_height: float = 0.8,
+        reset_noise: float = 0.02,
+    ):
+        super().__init__(Path(__file__).with_name("biped.xml"))
+        self.torque_cost_weight = torque_cost_weight
+        self.impact_cost_weight = impact_cost_weight
+        self.largest_impact_force = largest_impact_force
+        self.alive_bonus = alive_bonus
+        self.lowest_height = lowest_height
+        self.reset_noise = reset_noise
+        self._gears = self.model.actuator_gear[:, 0].copy()
+
+    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """The standing pose, every number moved by up to ``reset_noise``."""
+        qpos, qvel = super().initial_state(rng)
+        noise = self.reset_noise
+        return qpos + rng.uniform(-noise, noise, qpos.shape), qvel + rng.uniform(-noise, noise, qvel.shape)
+
+    def reward_terms(self, states: PhysicsStates) -> dict[str, np.ndarray]:
+        torques = states.controls * self._gears
+        return {
+            "forward_velocity": states.sensors["torso_velocity"][:, 0],
+            "torque_cost": -self.torque_cost_weight * np.square(torques).sum(axis=1),
+            "impact_cost": -self.impact_cost_weight * impact_cost(states, FEET, self.largest_impact_force),
+            "alive_bonus": np.full(len(torques), self.alive_bonus),
+        }
+
+    def terminated(self, states: PhysicsStates) -> np.ndarray:
+        """Whether the torso is lower than ``lowest_height``."""
+        return states.qpos[:, 2] < self.lowest_height
+
+
+class GaeBipedEnv(MujocoTaskEnv):
+    r"""
+    ``GaeBiped-v0``: a body of 36.4 kg with ten motors is to run along x; at most 2 000 steps of 0.01 s.
+
+    **Actions**: Box(-1, 1, (10,)), parts of the largest torque, which is 100 N·m at hips and knees and 20 N·m at shoulders.
+
+    ====== ============================== =======
+    Index  Actuator                       N·m at 1
+    ====== ============================== =======
+    0, 3   hip abduction (right, left)    100
+    1, 4   hip flexion                    100
+    2, 5   knee flexion                   100
+    6, 8   shoulder flexion               20
+    7, 9   shoulder abduction             20
+    ====== ============================== =======
+
+    **Observations**: Box(-inf, inf, (33,)), positions then velocities.
+
+    ====== ============================================================= =======
+    Index  Quantity                                                      Unit
+    ====== ============================================================= =======
+    0-2    position of the torso: x forward, y left, z up                m
+    3-6    orientation of the torso as a quaternion w, x, y, z           –
+    7-9    right leg: hip abduction, hip flexion, knee flexion           rad
+    10-12  left leg: likewise                                            rad
+    13-14  right arm: shoulder flexion, shoulder abduction               rad
+    15-16  left arm: likewise                                            rad
+    17-19  velocity of the torso along x, y, z                           m/s
+    20-22  angular velocity of the torso in its own frame                rad/s
+    23-32  angular velocities of the joints, ordered as 7-16             rad/s
+    ====== ============================================================= =======
+
+    **Reward**, by name in ``info``: ``forward_velocity`` (of the torso along x, m/s), ``torque_cost``
+    (:math:`-10^{-5}|u|^2`, u in N·m), ``impact_cost`` (:math:`-10^{-5}|f|^2`, f the ground's force on each leg in N, each
+    component cut to ±1) and ``alive_bonus`` (0.2).
+
+    **End**: the torso is lower than 0.8 m. **Start**: the standing pose, every number moved by up to 0.02.
+
+    :param task_kwargs: ``torque_cost_weight``, ``impact_cost_weight``, ``largest_impact_force``, ``alive_bonus``,
+        ``lowest_height`` and ``reset_noise``, by default as above
+    """
+
+    def __init__(self, render_mode: str | None = None, width: int = 480, height: int = 480, **task_kwargs: float):
+        super().__init__(Biped(**task_kwargs), render_mode, width, height)

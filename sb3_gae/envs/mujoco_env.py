@@ -1,0 +1,129 @@
+"""One environment of a :class:`~sb3_gae.envs.MujocoTask`, as gymnasium has them."""
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
+
+from sb3_gae.envs.mujoco_task import FULL_PHYSICS, MujocoTask, is_physical, total_reward
+
+
+class MujocoTaskEnv(gym.Env):
+    """
+    A gymnasium environment of a task; :class:`~sb3_gae.vec_env.MujocoVecEnv` steps many of them in one call.
+
+    ``info`` has the terms of the reward by name and, in a step whose numbers blew up, ``numerical_failure``. Such
+    a step ends the episode as a time limit would, with the state before it as the last, and earns nothing.
+
+    :param task: model, observations, rewards and endings
+    :param render_mode: ``"human"``, ``"rgb_array"``, ``"depth_array"`` or None
+    :param width: of rendered images, in pixels
+    :param height: of rendered images, in pixels
+    :param camera_name: of the model's cameras
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array", "depth_array"]}  # type: ignore[misc]
+
+    def __init__(
+        self,
+        task: MujocoTask,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 480,
+        camera_name: str | None = "track",
+    ):
+        self.task = task
+        self.metadata = {**type(self).metadata, "render_fps": round(1.0 / task.dt)}  # type: ignore[misc]
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"`render_mode` must be one of {self.metadata['render_modes']} or None, got {render_mode!r}.")
+        self.render_mode = render_mode
+        self.model, self.data = task.model, mujoco.MjData(task.model)
+        self.observation_space, self.action_space = task.observation_space, task.action_space
+        self._image = {"width": width, "height": height, "camera_name": camera_name}
+        self._renderer: MujocoRenderer | None = None
+        self._physics = np.zeros((1, mujoco.mj_stateSize(self.model, FULL_PHYSICS)))
+        self._was_reset = False
+
+    @property
+    def dt(self) -> float:
+        """Seconds in a step."""
+        return self.task.dt
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.set_state(*self.task.initial_state(self.np_random))
+        self._was_reset = True
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), {}
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        if not self._was_reset:
+            raise gym.error.ResetNeeded("Call `reset` before `step`.")
+        before = self.physics_state.copy()
+        controls = self.task.controls(np.asarray(action)[None])
+        self.data.ctrl[:] = controls[0]
+        mujoco.mj_step(self.model, self.data, nstep=self.task.frame_skip)
+        physics = self.physics_state
+        if not is_physical(physics)[0]:
+            return self._fail(before)
+        states = self.task.states(physics, controls, self.data.sensordata[None])
+        terms = {name: float(term[0]) for name, term in self.task.reward_terms(states).items()}
+        if self.render_mode == "human":
+            self.render()
+        return self._observation(), float(total_reward(terms)), bool(self.task.terminated(states)[0]), False, dict(terms)
+
+    def _fail(self, before: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """What a step returns whose numbers blew up."""
+        self.physics_state = before
+        return self._observation(), 0.0, False, True, {"numerical_failure": True}
+
+    @property
+    def physics_state(self) -> np.ndarray:
+        """The full physics state, shape (1, n_state)."""
+        mujoco.mj_getState(self.model, self.data, self._physics[0], FULL_PHYSICS)
+        return self._physics
+
+    @physics_state.setter
+    def physics_state(self, state: np.ndarray) -> None:
+        mujoco.mj_setState(self.model, self.data, np.ascontiguousarray(state.reshape(-1)), FULL_PHYSICS)
+        mujoco.mj_forward(self.model, self.data)
+
+    def set_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        """
+        Begin anew from a state of one's own.
+
+        :param qpos: shape (nq,)
+        :param qvel: shape (nv,)
+        :raises ValueError: if a shape is wrong
+        """
+        if np.shape(qpos) != (self.model.nq,) or np.shape(qvel) != (self.model.nv,):
+            raise ValueError(
+                f"`qpos` and `qvel` must have shapes ({self.model.nq},) and ({self.model.nv},), "
+                f"got {np.shape(qpos)} and {np.shape(qvel)}."
+            )
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(self.model, self.data)
+        self._was_reset = True
+
+    def _observation(self) -> np.ndarray:
+        states = self.task.states(self.physics_state, self.data.ctrl[None], self.data.sensordata[None])
+        return self.task.observations(states)[0].copy()
+
+    def render(self) -> Any:
+        if self.render_mode is None:
+            gym.logger.warn("Nothing to render: give `render_mode` when making the environment.")
+            return None
+        if self._renderer is None:
+            self._renderer = MujocoRenderer(self.model, self.data, **self._image)  # type: ignore[arg-type]
+        return self._renderer.render(self.render_mode)
+
+    def close(self) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

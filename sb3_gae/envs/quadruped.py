@@ -1,0 +1,89 @@
+"""The paper's quadruped (section 6.2.2): run forward on four legs."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from sb3_gae.envs.biped import impact_cost
+from sb3_gae.envs.mujoco_env import MujocoTaskEnv
+from sb3_gae.envs.mujoco_task import MujocoTask, PhysicsStates
+
+FEET = ("front_left_force", "back_left_force", "back_right_force", "front_right_force")
+
+
+class Quadruped(MujocoTask):
+    """Reward :math:`v_{fwd} - 10^{-6}|u|^2 - 10^{-3}|f_{impact}|^2 + 0.05`; see :class:`GaeQuadrupedEnv`."""
+
+    def __init__(
+        self,
+        torque_cost_weight: float = 1e-6,
+        impact_cost_weight: float = 1e-3,
+        largest_impact_force: float = 1.0,
+        alive_bonus: float = 0.05,
+        lowest_height: float = 0.2,
+        reset_noise: float = 0.02,
+    ):
+        super().__init__(Path(__file__).with_name("quadruped.xml"))
+        self.torque_cost_weight = torque_cost_weight
+        self.impact_cost_weight = impact_cost_weight
+        self.largest_impact_force = largest_impact_force
+        self.alive_bonus = alive_bonus
+        self.lowest_height = lowest_height
+        self.reset_noise = reset_noise
+        self._gears = self.model.actuator_gear[:, 0].copy()
+
+    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """The standing pose, every number moved by up to ``reset_noise``."""
+        qpos, qvel = super().initial_state(rng)
+        # Ankles bent until the feet stand below the ends of the legs' lower halves
+        qpos[8::2] = math.radians(57.0)
+        noise = self.reset_noise
+        return qpos + rng.uniform(-noise, noise, qpos.shape), qvel + rng.uniform(-noise, noise, qvel.shape)
+
+    def reward_terms(self, states: PhysicsStates) -> dict[str, np.ndarray]:
+        torques = states.controls * self._gears
+        return {
+            "forward_velocity": states.sensors["torso_velocity"][:, 0],
+            "torque_cost": -self.torque_cost_weight * np.square(torques).sum(axis=1),
+            "impact_cost": -self.impact_cost_weight * impact_cost(states, FEET, self.largest_impact_force),
+            "alive_bonus": np.full(len(torques), self.alive_bonus),
+        }
+
+    def terminated(self, states: PhysicsStates) -> np.ndarray:
+        """Whether the torso is lower than ``lowest_height``."""
+        return states.qpos[:, 2] < self.lowest_height
+
+
+class GaeQuadrupedEnv(MujocoTaskEnv):
+    r"""
+    ``GaeQuadruped-v0``: a sphere on four two-joint legs is to run along x; at most 2 000 steps of 0.01 s.
+
+    **Actions**: Box(-1, 1, (8,)), parts of the largest torque of 150 N·m: hip and ankle of the front left, back left,
+    back right and front right leg.
+
+    **Observations**: Box(-inf, inf, (29,)), positions then velocities.
+
+    ====== ============================================================= =======
+    Index  Quantity                                                      Unit
+    ====== ============================================================= =======
+    0-2    position of the torso: x forward, y left, z up                m
+    3-6    orientation of the torso as a quaternion w, x, y, z           –
+    7-14   hip and ankle of each leg, ordered as the actions             rad
+    15-17  velocity of the torso along x, y, z                           m/s
+    18-20  angular velocity of the torso in its own frame                rad/s
+    21-28  angular velocities of the joints, ordered as 7-14             rad/s
+    ====== ============================================================= =======
+
+    **Reward**, by name in ``info``: ``forward_velocity`` (of the torso along x, m/s), ``torque_cost``
+    (:math:`-10^{-6}|u|^2`, u in N·m), ``impact_cost`` (:math:`-10^{-3}|f|^2`, f the ground's force on each leg in N, each
+    component cut to ±1) and ``alive_bonus`` (0.05).
+
+    **End**: the torso is lower than 0.2 m. **Start**: the standing pose, every number moved by up to 0.02.
+
+    :param task_kwargs: ``torque_cost_weight``, ``impact_cost_weight``, ``largest_impact_force``, ``alive_bonus``,
+        ``lowest_height`` and ``reset_noise``, by default as above
+    """
+
+    def __init__(self, render_mode: str | None = None, width: int = 480, height: int = 480, **task_kwargs: float):
+        super().__init__(Quadruped(**task_kwargs), render_mode, width, height)

@@ -1,0 +1,6 @@
+"""Environments stepped in batches by native code, behind SB3's ``VecEnv``."""
+
+from sb3_gae.vec_env.mujoco_vec_env import MujocoVecEnv
+from sb3_gae.vec_env.step_infos import StepInfos
+
+__all__ = ["MujocoVecEnv", "StepInfos"]
