@@ -238,10 +238,13 @@ class TRPOGAE(OnPolicyAlgorithm):
             if not callback.on_step():
                 return False
 
-            self._update_info_buffer(infos, dones)
-            endings = terminal_observations(n_steps, dones, infos)
-            terminal.extend(endings)
-            truncated = np.isin(np.arange(env.num_envs), [ending.env for ending in endings])
+            truncated = np.zeros(env.num_envs, dtype=bool)
+            if dones.any():
+                ended = np.flatnonzero(dones)
+                self._update_info_buffer([infos[i] for i in ended], dones[ended])
+                endings = terminal_observations(n_steps, dones, infos)
+                terminal.extend(endings)
+                truncated[[ending.env for ending in endings]] = True
             rollout_buffer.add_step(self._last_obs, actions, rewards, self._last_episode_starts, dones, truncated)
             n_steps += 1
             self._last_obs = cast(Observations, new_obs)

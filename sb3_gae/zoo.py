@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from torch import nn
 
 from sb3_gae.trpo_gae import TRPOGAE
+from sb3_gae.zoo_batched_envs import add_batched_envs
 from sb3_gae.zoo_hub_repairs import repair_hub_verbs
 
 if TYPE_CHECKING:
@@ -135,6 +136,9 @@ def _add_default_hyperparams(exp_manager: ModuleType) -> None:
         original(*bound.args, **bound.kwargs)
 
     manager.__init__ = _mark_as_ours(init_with_our_default)
+    for name in ("create_envs", "_preprocess_hyperparams"):
+        _expect(manager, name, Callable)
+    add_batched_envs(manager)
 
 
 INTEGRATIONS: dict[str, Callable[[ModuleType], None]] = {
@@ -144,7 +148,7 @@ INTEGRATIONS: dict[str, Callable[[ModuleType], None]] = {
 }
 
 
-def _expect(module: ModuleType, name: str, kind: Any) -> Any:
+def _expect(module: ModuleType | type, name: str, kind: Any) -> Any:
     """
     Get an attribute of rl-zoo3 or say that it is not as we know it.
 

@@ -1,0 +1,22 @@
+"""Which ``VecEnv`` steps given environments fastest."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_gae.vec_env.mujoco_vec_env import MujocoVecEnv, can_batch
+
+
+def batched_vec_env(env_fns: Sequence[Callable[[], gym.Env]], **kwargs: Any) -> VecEnv:
+    """
+    To be given as ``vec_env_cls`` where one does not know whether the environments can be stepped in batches.
+
+    :param env_fns: each makes an environment
+    :param kwargs: passed on
+    :return: :class:`MujocoVecEnv` if it can step them, else SB3's ``DummyVecEnv``
+    """
+    envs = [make() for make in env_fns]
+    vec_env_class = MujocoVecEnv if all(can_batch(env) for env in envs) else DummyVecEnv
+    return vec_env_class([lambda env=env: env for env in envs], **kwargs)  # type: ignore[misc]
