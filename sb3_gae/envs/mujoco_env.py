@@ -51,9 +51,7 @@ class MujocoTaskEnv(gym.Env):
         """Seconds in a step."""
         return self.task.dt
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
         self.set_state(*self.task.initial_state(self.np_random))
         self._was_reset = True
