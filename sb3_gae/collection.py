@@ -94,7 +94,7 @@ def evaluate_rollout(
     :return: values of the last observations, shape (N,)
     :raises NumericalError: if a value or a log-probability is not finite
     """
-    samples, shape = rollout_buffer.batch(), rollout_buffer.rewards.shape
+    samples, mask = rollout_buffer.batch(), rollout_buffer.mask
     actions = distribution_actions(policy.action_space, samples.actions)
 
     def evaluate(observations: Any, actions: th.Tensor) -> th.Tensor:
@@ -102,10 +102,11 @@ def evaluate_rollout(
         return th.stack([values.flatten(), log_probs], dim=1)
 
     evaluated = in_chunks(evaluate, samples.observations, actions).cpu().numpy()
-    values, log_probs = evaluated[:, 0].reshape(shape), evaluated[:, 1].reshape(shape)
+    values, log_probs = np.zeros((2, *mask.shape), dtype=evaluated.dtype)
+    values[mask], log_probs[mask] = evaluated.T
     check_finite_rollout("value", values)
     check_finite_rollout("log-probability", log_probs)
-    rollout_buffer.set_values(values, log_probs, _bootstrap_values(policy, terminal, shape))
+    rollout_buffer.set_values(values, log_probs, _bootstrap_values(policy, terminal, mask.shape))
     return _predict_values(policy, last_observations)
 
 
@@ -132,13 +133,13 @@ def training_batch(rollout_buffer: GAERolloutBuffer, action_space: spaces.Space)
 def reward_returns(rollout_buffer: GAERolloutBuffer) -> np.ndarray:
     """
     :param rollout_buffer: full
-    :return: discounted returns of the rewards alone, no value function involved, shape (T, N)
+    :return: discounted returns of the rewards alone, no value function involved, shape (``n_samples``,)
     :raises NumericalError: if a return is not finite
     """
     nothing = np.zeros_like(rollout_buffer.rewards)
     returns = discounted_returns(rollout_buffer.rewards, nothing, rollout_buffer.dones, rollout_buffer.gamma)
     check_finite_rollout("discounted return", returns)
-    return returns
+    return returns[rollout_buffer.mask]
 
 
 def _bootstrap_values(policy: ActorCriticPolicy, terminal: list[TerminalObservation], shape: tuple[int, ...]) -> np.ndarray:

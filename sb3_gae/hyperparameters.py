@@ -73,16 +73,20 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
         check_count(name, values[name])
     for name in ("vf_steps", "n_critic_updates"):
         check_count(name, values[name], low=0)
+    if values["n_episodes"] is not None:
+        check_count("n_episodes", values["n_episodes"])
     if values["curvature_samples"] is not None:
         check_count("curvature_samples", values["curvature_samples"], low=2)
     check_choice("vf_optimizer", values["vf_optimizer"], ("trust_region", "adam"))
-    _check_batch(values["n_steps"], values["n_envs"], values["sub_sampling_factor"])
+    _check_batch(values["n_steps"], values["n_envs"], values["sub_sampling_factor"], values["n_episodes"])
     _check_buffer_class(values["rollout_buffer_class"])
     if "value_lambda" in values["rollout_buffer_kwargs"]:
         raise ValueError("Pass `value_lambda` to TRPOGAE itself and not in `rollout_buffer_kwargs`.")
 
 
-def _check_batch(n_steps: int, n_envs: int, sub_sampling_factor: int) -> None:
+def _check_batch(n_steps: int, n_envs: int, sub_sampling_factor: int, n_episodes: int | None) -> None:
+    if n_episodes is not None and n_episodes * n_envs < 2:
+        raise ValueError("A batch needs at least 2 episodes, but `n_episodes` = 1 in one environment gives 1; raise it.")
     n_samples = n_steps * n_envs // sub_sampling_factor
     if n_samples < 2:
         raise ValueError(

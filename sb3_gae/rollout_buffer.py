@@ -48,6 +48,10 @@ class GAERolloutBuffer(RolloutBuffer):
     to one :math:`\gamma`. Here ``rewards``, ``terminated``, ``truncated`` and ``bootstrap_values`` stay apart.
     All arrays have shape (T, N) (``observations`` and ``actions`` with further axes), also after :meth:`get`.
 
+    In batches of whole episodes an environment that has contributed all of its own is stepped on until the others have,
+    and ``mask``, shape (T, N), says which steps belong to the batch: only those come out of :meth:`get`, :meth:`batch`
+    and :meth:`lambda_sweep`. What the arrays hold elsewhere means nothing.
+
     When one of SB3's own algorithms fills the buffer, it has already mixed those values into the rewards;
     its endings then all count as terminations, which is what SB3 makes of them.
 
@@ -66,6 +70,7 @@ class GAERolloutBuffer(RolloutBuffer):
     truncated: np.ndarray
     bootstrap_values: np.ndarray
     last_values: np.ndarray
+    mask: np.ndarray
 
     def __init__(self, *args: Any, value_lambda: float | None = None, **kwargs: Any):
         self.value_lambda = value_lambda
@@ -78,7 +83,13 @@ class GAERolloutBuffer(RolloutBuffer):
         self.truncated = np.zeros(shape, dtype=bool)
         self.bootstrap_values = np.zeros(shape, dtype=np.float32)
         self.last_values = np.zeros(self.n_envs, dtype=np.float32)
+        self.mask = np.ones(shape, dtype=bool)
         self._endings_known = False
+
+    @property
+    def n_samples(self) -> int:
+        """Steps that belong to the batch."""
+        return int(np.count_nonzero(self.mask))
 
     @property
     def dones(self) -> np.ndarray:
@@ -98,6 +109,7 @@ class GAERolloutBuffer(RolloutBuffer):
         episode_start: np.ndarray,
         done: np.ndarray,
         truncated: np.ndarray,
+        counts: np.ndarray | None = None,
     ) -> None:
         """
         Store one step of all environments; values and log-probabilities follow for all steps at once.
@@ -108,12 +120,20 @@ class GAERolloutBuffer(RolloutBuffer):
         :param episode_start: whether the step was the first of its episode, shape (N,)
         :param done: whether it was the last of its episode, shape (N,)
         :param truncated: whether it was so because of a time limit, shape (N,)
+        :param counts: whether it belongs to the batch, shape (N,); None if all do
         """
+        if counts is not None:
+            self.mask[self.pos] = counts
         self.terminated[self.pos] = done & ~truncated
         self.truncated[self.pos] = truncated
         self._endings_known = True
         unknown = th.zeros(self.n_envs)
         self.add(obs, action, reward, episode_start, unknown, unknown)  # type: ignore[arg-type]
+
+    def finish(self) -> None:
+        """Call the buffer full: what has been stored is the whole batch."""
+        self.mask[self.pos :] = False
+        self.full = True
 
     def set_values(self, values: np.ndarray, log_probs: np.ndarray, bootstrap_values: np.ndarray) -> None:
         """
@@ -149,7 +169,7 @@ class GAERolloutBuffer(RolloutBuffer):
 
         :param gammas: discount factors, each in [0, 1], shape (G,)
         :param lambdas: weights of longer estimates, each in [0, 1], shape (L,)
-        :return: shape (G, L, T, N)
+        :return: shape (G, L, T, N); meaningless outside ``mask``
         :raises ValueError: if the buffer is not full, or a factor is out of range
         """
         self._check_full()
@@ -167,9 +187,9 @@ class GAERolloutBuffer(RolloutBuffer):
         :raises ValueError: if the buffer is not full, or a factor is out of range
         """
         gamma = self.gamma if gamma is None else gamma
-        grid = self.advantage_grid([gamma], [*lambdas, 1.0])[0].reshape(len(lambdas) + 1, -1).astype(np.float64)
+        grid = self.advantage_grid([gamma], [*lambdas, 1.0])[0][:, self.mask].astype(np.float64)
         advantages, unbiased = grid[:-1], grid[-1]
-        values = self.values.reshape(-1).astype(np.float64)
+        values = self.values[self.mask].astype(np.float64)
         return LambdaSweep(
             gae_lambda=np.asarray(lambdas, dtype=np.float64),
             mean_bias=(advantages - unbiased).mean(axis=1),
@@ -187,19 +207,18 @@ class GAERolloutBuffer(RolloutBuffer):
         :return: samples in a random order
         """
         self._check_full()
-        n_samples = self.buffer_size * self.n_envs
-        indices = np.random.permutation(n_samples)
-        for start in range(0, n_samples, batch_size or n_samples):
-            yield self._get_samples(indices[start : start + (batch_size or n_samples)])
+        indices = np.random.permutation(np.flatnonzero(self.mask))
+        for start in range(0, len(indices), batch_size or len(indices)):
+            yield self._get_samples(indices[start : start + (batch_size or len(indices))])
 
     def batch(self) -> RolloutBufferSamples:
         """
-        Everything in the order of storage, time first; on the CPU without a copy.
+        Everything in the order of storage, time first; on the CPU without a copy unless steps are masked.
 
-        :return: tensors of T times N samples
+        :return: tensors of ``n_samples`` samples, T times N unless steps are masked
         """
         self._check_full()
-        return self._get_samples(slice(None))
+        return self._get_samples(slice(None) if self.mask.all() else np.flatnonzero(self.mask))
 
     def _get_samples(self, batch_inds: np.ndarray | slice, env: VecNormalize | None = None) -> Any:
         return RolloutBufferSamples(self._samples_of(self.observations, batch_inds), *self._scalars_of(batch_inds))

@@ -3,6 +3,7 @@
 import copy
 import io
 import pathlib
+import warnings
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -29,6 +30,7 @@ from sb3_gae.collection import (
     terminal_observations,
     training_batch,
 )
+from sb3_gae.episode_quota import EpisodeQuota
 from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gae.policy_step import policy_parameters, policy_step
@@ -90,6 +92,9 @@ class TRPOGAE(OnPolicyAlgorithm):
     :param normalize_value: whether the value network's outputs are in units of a running scale of the returns
     :param curvature_samples: largest number of samples that curvature products use, drawn at random; None for all.
         Gradients, objectives and constraints always use every sample
+    :param n_episodes: collect this many whole episodes of each environment, as the paper does for cart-pole, and use the
+        steps of no others; ``n_steps`` is then the most that an environment takes, and should cover the longest
+        episodes. None for batches of ``n_steps`` steps
     :param foreign_arguments: arguments of PPO and A2C that have no meaning here; each warns and says what to use
     :raises ValueError: if an argument is outside its domain
     :raises TypeError: if an argument is unknown, or the rollout buffer is of another kind
@@ -140,6 +145,7 @@ class TRPOGAE(OnPolicyAlgorithm):
         vf_optimizer: str = "trust_region",
         normalize_value: bool = True,
         curvature_samples: int | None = 8_192,
+        n_episodes: int | None = None,
         **foreign_arguments: Any,
     ):
         super().__init__(
@@ -185,6 +191,8 @@ class TRPOGAE(OnPolicyAlgorithm):
         self.vf_optimizer = vf_optimizer
         self.normalize_value = normalize_value
         self.curvature_samples = curvature_samples
+        self.n_episodes = n_episodes
+        self._numerical_failures = 0
         if _init_setup_model:
             self._setup_model()
 
@@ -214,6 +222,9 @@ class TRPOGAE(OnPolicyAlgorithm):
         :raises NumericalError: if a parameter of the policy, an observation, action, reward or value is not finite
         """
         assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
+        quota = EpisodeQuota(env.num_envs, self.n_episodes)
+        if self.n_episodes is not None and not self._last_episode_starts.all():
+            self._last_obs, self._last_episode_starts = cast(Observations, env.reset()), np.ones(env.num_envs, dtype=bool)
         check_finite_parameters(self.policy)
         check_finite_step("observation", self._last_obs, 0)
         self.policy.set_training_mode(False)
@@ -224,7 +235,7 @@ class TRPOGAE(OnPolicyAlgorithm):
             self.policy.reset_noise(env.num_envs)
         callback.on_rollout_start()
 
-        while n_steps < n_rollout_steps:
+        while n_steps < n_rollout_steps and not quota.is_met:
             if self.use_sde and self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0:
                 self.policy.reset_noise(env.num_envs)
             actions = sample_actions(self.policy, self._last_obs, n_steps)
@@ -238,22 +249,41 @@ class TRPOGAE(OnPolicyAlgorithm):
             if not callback.on_step():
                 return False
 
+            counts = quota.counts
+            ended = dones if counts is None else dones & counts
             truncated = np.zeros(env.num_envs, dtype=bool)
-            if dones.any():
-                ended = np.flatnonzero(dones)
-                self._update_info_buffer([infos[i] for i in ended], dones[ended])
-                endings = terminal_observations(n_steps, dones, infos)
+            if ended.any():
+                self._record_endings([infos[i] for i in np.flatnonzero(ended)])
+                endings = terminal_observations(n_steps, ended, infos)
                 terminal.extend(endings)
                 truncated[[ending.env for ending in endings]] = True
-            rollout_buffer.add_step(self._last_obs, actions, rewards, self._last_episode_starts, dones, truncated)
+            rollout_buffer.add_step(self._last_obs, actions, rewards, self._last_episode_starts, dones, truncated, counts)
+            quota.add(dones)
             n_steps += 1
             self._last_obs = cast(Observations, new_obs)
             self._last_episode_starts = dones
 
+        if self.n_episodes is not None:
+            self._finish_episodes(rollout_buffer, quota)
         self._complete_rollout(rollout_buffer, terminal, self._last_obs, self._last_episode_starts)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
+
+    def _record_endings(self, infos: list[dict[str, Any]]) -> None:
+        self._update_info_buffer(infos, np.ones(len(infos), dtype=bool))
+        self._numerical_failures += sum(bool(info.get("numerical_failure")) for info in infos)
+        if self._numerical_failures:
+            self.logger.record("rollout/numerical_failures", self._numerical_failures)
+
+    def _finish_episodes(self, rollout_buffer: GAERolloutBuffer, quota: EpisodeQuota) -> None:
+        rollout_buffer.finish()
+        if not quota.is_met:
+            warnings.warn(
+                f"`n_steps` = {self.n_steps} ended before every environment had finished `n_episodes` = {self.n_episodes}; "
+                "the last episodes are cut there and their rest is estimated. Raise `n_steps`.",
+                stacklevel=2,
+            )
 
     def _complete_rollout(
         self,
@@ -305,7 +335,7 @@ class TRPOGAE(OnPolicyAlgorithm):
     def _step_policy(self, batch: TrainingBatch, parameters: list[th.Tensor]) -> StepRecord:
         advantages = standardized(batch.advantages) if self.normalize_advantage else batch.advantages
         if self.sub_sampling_factor > 1:
-            subset = random_subset(len(batch), len(batch) // self.sub_sampling_factor, self.device)
+            subset = random_subset(len(batch), max(2, len(batch) // self.sub_sampling_factor), self.device)
             batch, advantages = batch.take(subset), advantages[subset]  # type: ignore[arg-type]
         settings = TrustRegionSettings(
             radius=self.target_kl,

@@ -18,7 +18,8 @@ def update_summary(
     :return: sb3-contrib's names where it has one; the ``vf_`` entries only after trust-region steps
     """
     # Double precision: squares of values around 1e30 leave the range of single
-    collected, returns = (array.reshape(-1).astype(np.float64) for array in (rollout_buffer.values, rollout_buffer.returns))
+    mask = rollout_buffer.mask
+    collected, returns = (array[mask].astype(np.float64) for array in (rollout_buffer.values, rollout_buffer.returns))
     after = value_record.values_after.cpu().double().numpy()
     summary = {
         "policy_objective": policy_record.objective_after,
