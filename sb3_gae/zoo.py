@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from torch import nn
 
 from sb3_gae.trpo_gae import TRPOGAE
-from sb3_gae.zoo_batched_envs import add_batched_envs
 from sb3_gae.zoo_hub_repairs import repair_hub_verbs
+from sb3_gae.zoo_keys import add_keys
 
 if TYPE_CHECKING:
     import optuna
@@ -138,7 +138,7 @@ def _add_default_hyperparams(exp_manager: ModuleType) -> None:
     manager.__init__ = _mark_as_ours(init_with_our_default)
     for name in ("create_envs", "_preprocess_hyperparams"):
         _expect(manager, name, Callable)
-    add_batched_envs(manager)
+    add_keys(manager)
 
 
 INTEGRATIONS: dict[str, Callable[[ModuleType], None]] = {

@@ -1,5 +1,6 @@
 """What an installation must hold, and a hyperparameter file that fits the algorithm."""
 
+import configparser
 import inspect
 from importlib.metadata import distribution
 from pathlib import Path
@@ -9,6 +10,7 @@ import pytest
 import yaml
 
 import sb3_gae
+import sb3_gae.envs
 from sb3_gae import TRPOGAE, zoo
 
 HYPERPARAMS: dict[str, dict[str, Any]] = yaml.safe_load(zoo.default_hyperparams_path().read_text())
@@ -16,10 +18,11 @@ HYPERPARAMS: dict[str, dict[str, Any]] = yaml.safe_load(zoo.default_hyperparams_
 # rl-zoo3 takes these out before it hands the rest to the algorithm
 ZOO_KEYS = {
     *("callback", "env_kwargs", "env_wrapper", "frame_stack", "monitor_kwargs", "n_envs", "n_timesteps", "normalize"),
-    "vec_env_wrapper",
+    *("vec_env_wrapper", "batched_envs", "eval_freq"),
 }
 
 TASKS = [
+    *sb3_gae.envs.TASKS,
     *("CartPole-v1", "Acrobot-v1", "Pendulum-v1", "MountainCarContinuous-v0"),
     *("LunarLander-v3", "LunarLanderContinuous-v3", "BipedalWalker-v3"),
     *("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5", "Swimmer-v5", "Humanoid-v5", "HumanoidStandup-v5"),
@@ -69,6 +72,20 @@ def test_version_comes_from_one_place() -> None:
 
 def test_types_are_for_users_too() -> None:
     assert (Path(sb3_gae.__file__).parent / "py.typed").is_file()
+
+
+def test_files_that_are_no_code_are_installed_too() -> None:
+    package = Path(sb3_gae.__file__).parent
+    setup_cfg = package.parent / "setup.cfg"
+    if not setup_cfg.is_file():
+        pytest.skip("not a checkout")
+    settings = configparser.ConfigParser()
+    settings.read(setup_cfg)
+    patterns = settings["options.package_data"]["sb3_gae"].split()
+    installed = {file for pattern in patterns for file in package.glob(pattern)}
+    files = {file for file in package.rglob("*") if file.is_file() and file.suffix not in (".py", ".pyc")}
+    assert len([file for file in files if file.suffix == ".xml"]) >= 3
+    assert files <= installed
 
 
 def test_extras_exist() -> None:

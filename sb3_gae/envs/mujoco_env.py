@@ -15,7 +15,7 @@ class MujocoTaskEnv(gym.Env):
     A gymnasium environment of a task; :class:`~sb3_gae.vec_env.MujocoVecEnv` steps many of them in one call.
 
     ``info`` has the terms of the reward by name and, in a step whose numbers blew up, ``numerical_failure``. Such
-    a step ends the episode as a time limit would, with the state before it as the last, and earns nothing.
+    a step ends the episode as a time limit would, with the state before it as the last, and all its terms are 0.
 
     :param task: model, observations, rewards and endings
     :param render_mode: ``"human"``, ``"rgb_array"``, ``"depth_array"`` or None
@@ -62,23 +62,30 @@ class MujocoTaskEnv(gym.Env):
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         if not self._was_reset:
             raise gym.error.ResetNeeded("Call `reset` before `step`.")
+        action = np.asarray(action)
+        if action.shape != self.action_space.shape:
+            raise ValueError(f"`action` must have shape {self.action_space.shape}, got {action.shape}.")
         before = self.physics_state.copy()
-        controls = self.task.controls(np.asarray(action)[None])
+        controls = self.task.controls(action[None])
         self.data.ctrl[:] = controls[0]
-        mujoco.mj_step(self.model, self.data, nstep=self.task.frame_skip)
-        physics = self.physics_state
-        if not is_physical(physics)[0]:
-            return self._fail(before)
-        states = self.task.states(physics, controls, self.data.sensordata[None])
+        sound = self._advance()
+        if not sound:
+            self.physics_state = before
+        states = self.task.states(self.physics_state, controls, self.data.sensordata[None])
         terms = {name: float(term[0]) for name, term in self.task.reward_terms(states).items()}
+        if not sound:
+            return self._observation(), 0.0, False, True, dict.fromkeys(terms, 0.0) | {"numerical_failure": True}
         if self.render_mode == "human":
             self.render()
         return self._observation(), float(total_reward(terms)), bool(self.task.terminated(states)[0]), False, dict(terms)
 
-    def _fail(self, before: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """What a step returns whose numbers blew up."""
-        self.physics_state = before
-        return self._observation(), 0.0, False, True, {"numerical_failure": True}
+    def _advance(self) -> bool:
+        """Take the physics steps of one control step and return whether every one of them gave sound numbers."""
+        for _ in range(self.task.frame_skip):
+            mujoco.mj_step(self.model, self.data)
+            if not is_physical(self.physics_state)[0]:
+                return False
+        return True
 
     @property
     def physics_state(self) -> np.ndarray:
@@ -119,6 +126,8 @@ class MujocoTaskEnv(gym.Env):
             return None
         if self._renderer is None:
             self._renderer = MujocoRenderer(self.model, self.data, **self._image)  # type: ignore[arg-type]
+        # A step leaves bodies and cameras where they were at its beginning
+        mujoco.mj_fwdPosition(self.model, self.data)
         return self._renderer.render(self.render_mode)
 
     def close(self) -> None:

@@ -66,6 +66,8 @@ class MujocoTask:
             for i, (adr, dim) in enumerate(zip(self.model.sensor_adr, self.model.sensor_dim, strict=True))
         }
         self._initial_data = mujoco.MjData(self.model)
+        # MuJoCo has zeros where a model gives no range
+        self.model.actuator_ctrlrange[self.model.actuator_ctrllimited == 0] = -np.inf, np.inf
         bounds = self.model.actuator_ctrlrange.astype(np.float32)
         self.action_space = spaces.Box(bounds[:, 0], bounds[:, 1], dtype=np.float32)
         states = self.states(*(np.zeros((1, n)) for n in self._sizes))

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_gae.envs.mujoco_env import MujocoTaskEnv
-from sb3_gae.envs.mujoco_task import is_physical, total_reward
+from sb3_gae.envs.mujoco_task import MujocoTask, is_physical, total_reward
 from sb3_gae.vec_env.monitoring import find_monitor, record_episode
 from sb3_gae.vec_env.step_infos import StepInfos
 
@@ -33,28 +33,36 @@ class MujocoVecEnv(VecEnv):
 
     The environments that the functions make are kept: each draws its own initial states, and attributes, methods
     and pictures are asked of them, with the present state handed to them first. Between resets they are not stepped.
+    They share the first one's ``task``, so that whoever changes it changes it for all of them.
 
     :param env_fns: each makes an environment whose innermost is a :class:`~sb3_gae.envs.MujocoTaskEnv`
     :param n_threads: that step the physics; None for as many as there are cores
-    :raises ValueError: if an environment is of another kind, has a wrapper that would have to see each step,
-        or differs from the first
+    :raises ValueError: if there is no environment or one of them comes twice, is of another kind, has a wrapper that
+        would have to see each step, or differs from the first; or if ``n_threads`` is less than 1
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]], n_threads: int | None = None):
+        if n_threads is not None and n_threads < 1:
+            raise ValueError(f"`n_threads` must be at least 1 or None, got {n_threads}.")
         self.envs = [make() for make in env_fns]
         self._bases = [_base_of(env) for env in self.envs]
+        if not self.envs or len({id(base) for base in self._bases}) != len(self.envs):
+            raise ValueError("`env_fns` must make at least one environment, and a new one each.")
         self._limits = np.array([_time_limit(env) for env in self.envs])
         self._monitors = [find_monitor(env) for env in self.envs]
         self._was_reset = False
         self.task = self._bases[0].task
-        if any(_settings_of(base) != _settings_of(self._bases[0]) for base in self._bases):
+        expected = _settings_of(self.task)
+        if any(_settings_of(base.task) != expected for base in self._bases[1:]):
             raise ValueError("All environments of a MujocoVecEnv must be of one task with the same arguments.")
+        for base in self._bases:
+            base.task = self.task
         n_envs, model = len(self.envs), self.task.model
         super().__init__(n_envs, self.task.observation_space, self.task.action_space)
         self.metadata = self.envs[0].metadata
         #: steps whose numbers blew up, since the beginning
         self.numerical_failures = 0
-        n_threads = min(n_envs, n_threads or len(os.sched_getaffinity(0)))
+        n_threads = min(n_envs, n_threads or _n_cores())
         self._pool = Rollout(nthread=n_threads if n_threads > 1 else 0)
         self._models, self._datas = [model] * n_envs, [mujoco.MjData(model) for _ in range(n_threads)]
         n_state = self._bases[0].physics_state.shape[1]
@@ -75,7 +83,10 @@ class MujocoVecEnv(VecEnv):
     def step_async(self, actions: np.ndarray) -> None:
         if not self._was_reset:
             raise gym.error.ResetNeeded("Call `reset` before `step`.")
-        self._controls[:] = self.task.controls(np.asarray(actions))[:, None]
+        actions = np.asarray(actions)
+        if actions.shape != (expected := (self.num_envs, *(self.action_space.shape or ()))):
+            raise ValueError(f"`actions` must have shape {expected}, got {actions.shape}.")
+        self._controls[:] = self.task.controls(actions)[:, None]
 
     def step_wait(self) -> VecEnvStepReturn:
         self._pool.rollout(
@@ -96,27 +107,29 @@ class MujocoVecEnv(VecEnv):
             self._new_physics[failed, -1] = self._physics[failed]
             self._sensor_data[failed] = 0.0
         self._physics[:] = self._new_physics[:, -1]
-        terms = self.task.reward_terms(states)
-        rewards = np.asarray(total_reward(terms), dtype=np.float64)
-        terminated = self.task.terminated(states)
+        # Copies: what a task returns may be a part of arrays that the next step writes to
+        terms = {name: np.array(term, dtype=np.float64) for name, term in self.task.reward_terms(states).items()}
+        terminated = np.array(self.task.terminated(states), dtype=bool)
+        observations = np.array(self.task.observations(states))
         if failed is not None:
-            rewards, terminated = np.where(failed, 0.0, rewards), terminated & ~failed
-        observations = self.task.observations(states)
+            terminated[failed] = False
+            for term in terms.values():
+                term[failed] = 0.0
+        rewards = np.asarray(total_reward(terms), dtype=np.float64)
         self._lengths += 1
         self._returns += rewards
         dones = terminated | (self._lengths >= self._limits)
         if failed is not None:
             dones |= failed
-        infos = StepInfos(self.num_envs, terms)
+        infos = StepInfos(self.num_envs, terms | {"TimeLimit.truncated": dones & ~terminated})
         for env in np.flatnonzero(dones).tolist():
             if failed is not None and failed[env]:
-                infos[env] = {"numerical_failure": True}
+                infos[env]["numerical_failure"] = True
                 self._count_failure()
-            self._end_episode(env, bool(terminated[env]), observations, infos[env])
+            self._end_episode(env, observations, infos[env])
         return observations, rewards.astype(np.float32), dones, cast(list[dict[str, Any]], infos)
 
-    def _end_episode(self, env: int, terminated: bool, observations: np.ndarray, info: dict[str, Any]) -> None:
-        info["TimeLimit.truncated"] = not terminated
+    def _end_episode(self, env: int, observations: np.ndarray, info: dict[str, Any]) -> None:
         info["terminal_observation"] = observations[env].copy()
         if (monitor := self._monitors[env]) is not None:
             record_episode(monitor, float(self._returns[env]), int(self._lengths[env]), info)
@@ -150,11 +163,6 @@ class MujocoVecEnv(VecEnv):
         self._show(range(self.num_envs))
         return [cast(np.ndarray, env.render()) for env in self.envs]
 
-    def render(self, mode: str | None = None) -> np.ndarray | None:
-        if self.render_mode == "human" and self.num_envs == 1:
-            self._show([0])
-        return super().render(mode)
-
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         chosen = list(self._get_indices(indices))
         self._show(chosen)
@@ -171,6 +179,8 @@ class MujocoVecEnv(VecEnv):
         for env in chosen:
             # The method may have moved the environment
             self._physics[env] = self._bases[env].physics_state[0]
+            if method_name == "reset":
+                self._lengths[env], self._returns[env] = 0, 0.0
         return results
 
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
@@ -212,14 +222,23 @@ def _base_of(env: gym.Env) -> MujocoTaskEnv:
 
 
 def _time_limit(env: gym.Env) -> int:
+    """The shortest, if there are several."""
+    limit = int(np.iinfo(np.int64).max)
     while isinstance(env, gym.Wrapper):
         if isinstance(env, TimeLimit):
-            return env._max_episode_steps
+            limit = min(limit, env._max_episode_steps)
         env = env.env
-    return np.iinfo(np.int64).max
+    return limit
 
 
-def _settings_of(base: MujocoTaskEnv) -> dict[str, Any]:
-    """The class and the plain settings of an environment's task, to be compared."""
-    plain = {name: value for name, value in vars(base.task).items() if isinstance(value, int | float | str | bool)}
-    return plain | {"class": type(base.task)}
+def _settings_of(task: MujocoTask) -> dict[str, Any]:
+    """The class, the model and the plain settings of a task, to be compared."""
+    plain = {name: value for name, value in vars(task).items() if isinstance(value, int | float | str | bool)}
+    model = np.empty(mujoco.mj_sizeModel(task.model), dtype=np.uint8)
+    mujoco.mj_saveModel(task.model, None, model)
+    return plain | {"class": type(task), "model": model.tobytes()}
+
+
+def _n_cores() -> int:
+    """That this process may use, where the system tells."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -11,7 +11,7 @@ class StepInfos(Sequence[dict[str, Any]]):
     Reads like SB3's list of dictionaries. What has been handed out is kept, so that a wrapper can add to it.
 
     :param n_envs: number of environments, N
-    :param columns: numbers that every environment has, by name, each of shape (N,)
+    :param columns: numbers or truth values that every environment has, by name, each of shape (N,)
     """
 
     def __init__(self, n_envs: int, columns: dict[str, np.ndarray]):
@@ -31,7 +31,7 @@ class StepInfos(Sequence[dict[str, Any]]):
             return [self[i] for i in range(*index.indices(self._n_envs))]
         env = range(self._n_envs)[index]
         if env not in self._made:
-            self._made[env] = {name: float(column[env]) for name, column in self.columns.items()}
+            self._made[env] = {name: column[env].item() for name, column in self.columns.items()}
         return self._made[env]
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
