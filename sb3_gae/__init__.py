@@ -12,7 +12,7 @@ from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gae.presets import CARTPOLE_NETWORKS, LOCOMOTION_NETWORKS, PAPER_VALUE_FIT
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer, LambdaSweep
 from sb3_gae.trpo_gae import TRPOGAE
-from sb3_gae.vec_env import MujocoVecEnv
+from sb3_gae.vec_env import EnvPoolVecEnv, MujocoVecEnv
 
 __version__ = "0.1.0"
 
@@ -24,6 +24,7 @@ __all__ = [
     "PAPER_VALUE_FIT",
     "TRPOGAE",
     "CnnPolicy",
+    "EnvPoolVecEnv",
     "GAEDictRolloutBuffer",
     "GAERolloutBuffer",
     "LambdaSweep",

@@ -207,7 +207,7 @@ class GAERolloutBuffer(RolloutBuffer):
         :return: samples in a random order
         """
         self._check_full()
-        indices = np.random.permutation(np.flatnonzero(self.mask))
+        indices = np.flatnonzero(self.mask)[np.random.permutation(self.n_samples)]
         for start in range(0, len(indices), batch_size or len(indices)):
             yield self._get_samples(indices[start : start + (batch_size or len(indices))])
 

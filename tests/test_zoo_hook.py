@@ -27,6 +27,8 @@ KNOWN_LAYOUT = {
         from rl_zoo3.utils import ALGOS
         class ExperimentManager:
             def __init__(self, args, algo, config=None): self.config = config or "hyperparams/of/the/zoo.yml"
+            def _preprocess_hyperparams(self, hyperparams): ...
+            def create_envs(self, n_envs, eval_env=False, no_log=False): ...
         """,
 }
 

@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_gae.vec_env.envpool_vec_env import EnvPoolVecEnv, can_pool
 from sb3_gae.vec_env.mujoco_vec_env import MujocoVecEnv, can_batch
 
 
@@ -15,8 +16,12 @@ def batched_vec_env(env_fns: Sequence[Callable[[], gym.Env]], **kwargs: Any) -> 
 
     :param env_fns: each makes an environment
     :param kwargs: passed on
-    :return: :class:`MujocoVecEnv` if it can step them, else SB3's ``DummyVecEnv``
+    :return: :class:`MujocoVecEnv` or :class:`EnvPoolVecEnv` if one of them can step all, else SB3's ``DummyVecEnv``
     """
     envs = [make() for make in env_fns]
-    vec_env_class = MujocoVecEnv if all(can_batch(env) for env in envs) else DummyVecEnv
-    return vec_env_class([lambda env=env: env for env in envs], **kwargs)  # type: ignore[misc]
+    vec_env_class: Callable[..., VecEnv] = DummyVecEnv
+    if all(can_batch(env) for env in envs):
+        vec_env_class = MujocoVecEnv
+    elif all(can_pool(env) for env in envs):
+        vec_env_class = EnvPoolVecEnv
+    return vec_env_class([lambda env=env: env for env in envs], **kwargs)

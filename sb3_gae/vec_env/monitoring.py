@@ -1,22 +1,23 @@
-"""What SB3's ``Monitor`` does at the end of an episode, for environments that it does not step itself."""
+"""What SB3's ``Monitor`` does at the beginning and the end of an episode, for environments that it does not step itself."""
 
 import time
 from typing import Any
 
-import gymnasium as gym
 from stable_baselines3.common.monitor import Monitor
 
 
-def find_monitor(env: gym.Env) -> Monitor | None:
+def begin_episode(monitor: Monitor) -> None:
     """
-    :param env: an environment in its wrappers
-    :return: the outermost ``Monitor``, if there is one
+    :param monitor: of the environment
+    :raises RuntimeError: if the last episode is not over, and the monitor does not allow that
     """
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, Monitor):
-            return env
-        env = env.env
-    return None
+    if not monitor.allow_early_resets and not monitor.needs_reset:
+        raise RuntimeError(
+            "Tried to reset an environment before done. If you want to allow early resets, "
+            "wrap your env with Monitor(env, path, allow_early_resets=True)"
+        )
+    monitor.rewards = []
+    monitor.needs_reset = False
 
 
 def record_episode(monitor: Monitor, episode_return: float, length: int, info: dict[str, Any]) -> None:

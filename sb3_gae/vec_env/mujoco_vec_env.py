@@ -1,29 +1,22 @@
 """Many environments of one :class:`~sb3_gae.envs.MujocoTask`, stepped by one native call."""
 
-import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, cast
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from mujoco.rollout import Rollout
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_gae.envs.mujoco_env import MujocoTaskEnv
 from sb3_gae.envs.mujoco_task import MujocoTask, is_physical, total_reward
-from sb3_gae.vec_env.monitoring import find_monitor, record_episode
-from sb3_gae.vec_env.step_infos import StepInfos
-
-# These either do nothing to a step or are done here for the whole batch
-_KNOWN_WRAPPERS = (Monitor, OrderEnforcing, PassiveEnvChecker, TimeLimit)
+from sb3_gae.vec_env.batched_vec_env import BatchedVecEnv, make_envs
+from sb3_gae.vec_env.wrappers import foreign_wrapper
 
 
-class MujocoVecEnv(VecEnv):
+class MujocoVecEnv(BatchedVecEnv):
     """
     Takes the place of ``DummyVecEnv`` and gives the same trajectories, faster.
 
@@ -42,51 +35,23 @@ class MujocoVecEnv(VecEnv):
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]], n_threads: int | None = None):
-        if n_threads is not None and n_threads < 1:
-            raise ValueError(f"`n_threads` must be at least 1 or None, got {n_threads}.")
-        self.envs = [make() for make in env_fns]
-        self._bases = [_base_of(env) for env in self.envs]
-        if not self.envs or len({id(base) for base in self._bases}) != len(self.envs):
-            raise ValueError("`env_fns` must make at least one environment, and a new one each.")
-        self._limits = np.array([_time_limit(env) for env in self.envs])
-        self._monitors = [find_monitor(env) for env in self.envs]
-        self._was_reset = False
-        self.task = self._bases[0].task
-        expected = _settings_of(self.task)
-        if any(_settings_of(base.task) != expected for base in self._bases[1:]):
-            raise ValueError("All environments of a MujocoVecEnv must be of one task with the same arguments.")
+        envs = make_envs(env_fns)
+        self._bases = [_base_of(env) for env in envs]
+        self.task = _common_task(self._bases)
+        model = self.task.model
+        super().__init__(envs, self.task.observation_space, self.task.action_space, n_threads)
         for base in self._bases:
             base.task = self.task
-        n_envs, model = len(self.envs), self.task.model
-        super().__init__(n_envs, self.task.observation_space, self.task.action_space)
-        self.metadata = self.envs[0].metadata
-        #: steps whose numbers blew up, since the beginning
-        self.numerical_failures = 0
-        n_threads = min(n_envs, n_threads or _n_cores())
-        self._pool = Rollout(nthread=n_threads if n_threads > 1 else 0)
-        self._models, self._datas = [model] * n_envs, [mujoco.MjData(model) for _ in range(n_threads)]
-        n_state = self._bases[0].physics_state.shape[1]
-        self._physics = np.zeros((n_envs, n_state))
-        self._new_physics = np.zeros((n_envs, self.task.frame_skip, n_state))
-        self._sensor_data = np.zeros((n_envs, self.task.frame_skip, model.nsensordata))
-        self._controls = np.zeros((n_envs, self.task.frame_skip, model.nu))
-        self._lengths = np.zeros(n_envs, dtype=np.int64)
-        self._returns = np.zeros(n_envs)
-
-    def reset(self) -> np.ndarray:
-        observations = np.stack([self._reset_env(env, self._seeds[env], self._options[env]) for env in range(self.num_envs)])
-        self._was_reset = True
-        self._reset_seeds()
-        self._reset_options()
-        return observations
+        self._pool = Rollout(nthread=self.n_threads if self.n_threads > 1 else 0)
+        self._models, self._datas = [model] * self.num_envs, [mujoco.MjData(model) for _ in range(self.n_threads)]
+        n_state, frame_skip = self._bases[0].physics_state.shape[1], self.task.frame_skip
+        self._physics = np.zeros((self.num_envs, n_state))
+        self._new_physics = np.zeros((self.num_envs, frame_skip, n_state))
+        self._sensor_data = np.zeros((self.num_envs, frame_skip, model.nsensordata))
+        self._controls = np.zeros((self.num_envs, frame_skip, model.nu))
 
     def step_async(self, actions: np.ndarray) -> None:
-        if not self._was_reset:
-            raise gym.error.ResetNeeded("Call `reset` before `step`.")
-        actions = np.asarray(actions)
-        if actions.shape != (expected := (self.num_envs, *(self.action_space.shape or ()))):
-            raise ValueError(f"`actions` must have shape {expected}, got {actions.shape}.")
-        self._controls[:] = self.task.controls(actions)[:, None]
+        self._controls[:] = self.task.controls(self._check_actions(actions))[:, None]
 
     def step_wait(self) -> VecEnvStepReturn:
         self._pool.rollout(
@@ -116,45 +81,20 @@ class MujocoVecEnv(VecEnv):
             for term in terms.values():
                 term[failed] = 0.0
         rewards = np.asarray(total_reward(terms), dtype=np.float64)
-        self._lengths += 1
-        self._returns += rewards
-        dones = terminated | (self._lengths >= self._limits)
-        if failed is not None:
-            dones |= failed
-        infos = StepInfos(self.num_envs, terms | {"TimeLimit.truncated": dones & ~terminated})
-        for env in np.flatnonzero(dones).tolist():
-            if failed is not None and failed[env]:
-                infos[env]["numerical_failure"] = True
-                self._count_failure()
-            self._end_episode(env, observations, infos[env])
-        return observations, rewards.astype(np.float32), dones, cast(list[dict[str, Any]], infos)
+        return self._finish_step(observations, rewards, terminated, failed, terms)
 
-    def _end_episode(self, env: int, observations: np.ndarray, info: dict[str, Any]) -> None:
-        info["terminal_observation"] = observations[env].copy()
-        if (monitor := self._monitors[env]) is not None:
-            record_episode(monitor, float(self._returns[env]), int(self._lengths[env]), info)
-        observations[env] = self._reset_env(env, None, {})
-
-    def _reset_env(self, env: int, seed: int | None, options: dict[str, Any]) -> np.ndarray:
-        maybe_options = {"options": options} if options else {}
-        observation, self.reset_infos[env] = self.envs[env].reset(seed=seed, **maybe_options)
-        self._physics[env] = self._bases[env].physics_state[0]
-        self._lengths[env], self._returns[env] = 0, 0.0
-        return observation
-
-    def _count_failure(self) -> None:
-        if self.numerical_failures == 0:
-            warnings.warn(
-                "The physics of an environment gave numbers that are not finite; its episode was cut before them. "
-                "Smaller actions or a shorter timestep may help. Further failures are only counted.",
-                stacklevel=2,
-            )
-        self.numerical_failures += 1
+    def _restart_envs(self, indices: np.ndarray, seeds: Sequence[int | None], options: Sequence[dict[str, Any]]) -> np.ndarray:
+        observations = []
+        for env, seed, its_options in zip(indices.tolist(), seeds, options, strict=True):
+            maybe_options = {"options": its_options} if its_options else {}
+            observation, self.reset_infos[env] = self.envs[env].reset(seed=seed, **maybe_options)
+            self._physics[env] = self._bases[env].physics_state[0]
+            observations.append(observation)
+        return np.stack(observations)
 
     def close(self) -> None:
         self._pool.close()
-        for env in self.envs:
-            env.close()
+        super().close()
 
     def get_images(self) -> list[np.ndarray | None]:
         if self.render_mode != "rgb_array":
@@ -164,9 +104,8 @@ class MujocoVecEnv(VecEnv):
         return [cast(np.ndarray, env.render()) for env in self.envs]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        chosen = list(self._get_indices(indices))
-        self._show(chosen)
-        return [self.envs[env].get_wrapper_attr(attr_name) for env in chosen]
+        self._show(self._get_indices(indices))
+        return super().get_attr(attr_name, indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         for env in self._get_indices(indices):
@@ -183,12 +122,7 @@ class MujocoVecEnv(VecEnv):
                 self._lengths[env], self._returns[env] = 0, 0.0
         return results
 
-    def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
-        from stable_baselines3.common.env_util import is_wrapped  # a cycle at the top: env_util imports vec_env
-
-        return [is_wrapped(self.envs[env], wrapper_class) for env in self._get_indices(indices)]
-
-    def _show(self, indices: Sequence[int] | range) -> None:
+    def _show(self, indices: Iterable[int]) -> None:
         """Hand the present state to the environments that are about to be asked something."""
         if self._was_reset:
             for env in indices:
@@ -200,35 +134,21 @@ def can_batch(env: gym.Env) -> bool:
     :param env: an environment in its wrappers
     :return: whether :class:`MujocoVecEnv` can step it
     """
-    return isinstance(env.unwrapped, MujocoTaskEnv) and _foreign_wrapper(env) is None
-
-
-def _foreign_wrapper(env: gym.Env) -> gym.Wrapper | None:
-    while isinstance(env, gym.Wrapper):
-        if not isinstance(env, _KNOWN_WRAPPERS):
-            return env
-        env = env.env
-    return None
+    return isinstance(env.unwrapped, MujocoTaskEnv) and foreign_wrapper(env) is None
 
 
 def _base_of(env: gym.Env) -> MujocoTaskEnv:
     base = env.unwrapped
     if not isinstance(base, MujocoTaskEnv):
         raise ValueError(f"MujocoVecEnv steps environments of a MujocoTask, got {base}; use DummyVecEnv for it.")
-    if (wrapper := _foreign_wrapper(env)) is not None:
-        name = type(wrapper).__name__
-        raise ValueError(f"MujocoVecEnv cannot show each step to the wrapper {name}; use DummyVecEnv, or leave it out.")
     return base
 
 
-def _time_limit(env: gym.Env) -> int:
-    """The shortest, if there are several."""
-    limit = int(np.iinfo(np.int64).max)
-    while isinstance(env, gym.Wrapper):
-        if isinstance(env, TimeLimit):
-            limit = min(limit, env._max_episode_steps)
-        env = env.env
-    return limit
+def _common_task(bases: Sequence[MujocoTaskEnv]) -> MujocoTask:
+    expected = _settings_of(bases[0].task)
+    if any(_settings_of(base.task) != expected for base in bases[1:]):
+        raise ValueError("All environments of a MujocoVecEnv must be of one task with the same arguments.")
+    return bases[0].task
 
 
 def _settings_of(task: MujocoTask) -> dict[str, Any]:
@@ -237,8 +157,3 @@ def _settings_of(task: MujocoTask) -> dict[str, Any]:
     model = np.empty(mujoco.mj_sizeModel(task.model), dtype=np.uint8)
     mujoco.mj_saveModel(task.model, None, model)
     return plain | {"class": type(task), "model": model.tobytes()}
-
-
-def _n_cores() -> int:
-    """That this process may use, where the system tells."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

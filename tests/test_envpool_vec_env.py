@@ -1,0 +1,367 @@
+"""EnvPool behind SB3's ``VecEnv``: transitions of gymnasium's MuJoCo tasks, no step lost or made up, and plain refusals."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from envs_for_tests import small_model, train_once
+from gymnasium.wrappers import ClipAction
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor, load_results
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
+
+from sb3_gae import EnvPoolVecEnv
+from sb3_gae.vec_env import batched_vec_env
+from sb3_gae.vec_env.envpool_vec_env import can_pool
+
+pytest.importorskip("envpool", reason="an optional extra: pip install 'sb3-gae[fast]'")
+
+State = tuple[np.ndarray, np.ndarray]
+EnvFns = list[Callable[[], gym.Env]]
+
+
+def after(n_hidden: int, n_positions: int, n_velocities: int) -> Callable[[np.ndarray], State]:
+    """Positions, less the first ones which nothing depends on, then velocities."""
+
+    def state(observation: np.ndarray) -> State:
+        positions, velocities = np.split(observation[: n_positions - n_hidden + n_velocities], [n_positions - n_hidden])
+        return np.concatenate([np.zeros(n_hidden), positions]), velocities
+
+    return state
+
+
+def of_double_pendulum(observation: np.ndarray) -> State:
+    return np.append(observation[0], np.arctan2(observation[1:3], observation[3:5])), observation[5:8]
+
+
+def of_reacher(observation: np.ndarray) -> State:
+    angles = np.arctan2(observation[2:4], observation[0:2])
+    return np.concatenate([angles, observation[4:6]]), np.concatenate([observation[6:8], np.zeros(2)])
+
+
+def of_pusher(observation: np.ndarray) -> State:
+    # The object's slides run along y and x, from where the model has it
+    object_ = observation[17:19] - (0.45, -0.05)
+    return np.concatenate([observation[:7], object_[::-1], np.zeros(2)]), np.append(observation[7:14], np.zeros(4))
+
+
+# How to read the physics' state from what is observed at the start of an episode
+STATES: dict[str, Callable[[np.ndarray], State]] = {
+    "Ant-v5": after(2, 15, 14),
+    "HalfCheetah-v5": after(1, 9, 9),
+    "Hopper-v5": after(1, 6, 6),
+    "Humanoid-v5": after(2, 24, 23),
+    "HumanoidStandup-v5": after(2, 24, 23),
+    "InvertedDoublePendulum-v5": of_double_pendulum,
+    "InvertedPendulum-v5": after(0, 2, 2),
+    "Pusher-v5": of_pusher,
+    "Reacher-v5": of_reacher,
+    "Swimmer-v5": after(2, 5, 5),
+    "Walker2d-v5": after(1, 9, 9),
+}
+
+# Nothing depends on them, and the twin begins elsewhere
+PLACES = {"x_position", "y_position", "distance_from_origin"}
+
+every_task = pytest.mark.parametrize("task", STATES)
+
+
+def functions(task: str, n_envs: int, max_episode_steps: int = 8, **kwargs: Any) -> EnvFns:
+    """As ``make_vec_env`` has them."""
+    return [lambda: Monitor(gym.make(task, max_episode_steps=max_episode_steps, **kwargs))] * n_envs
+
+
+def pool(task: str, n_envs: int = 2, seed: int = 0, **kwargs: Any) -> EnvPoolVecEnv:
+    env = EnvPoolVecEnv(functions(task, n_envs, **kwargs), 1)
+    env.seed(seed)
+    return env
+
+
+def random_actions(env: VecEnv, rng: np.random.Generator) -> np.ndarray:
+    space: Any = env.action_space
+    return rng.uniform(space.low, space.high, (env.num_envs, *space.shape)).astype(np.float32)
+
+
+class Twin:
+    """Gymnasium's environment, put where the pool's begins its episodes."""
+
+    def __init__(self, task: str, max_episode_steps: int):
+        self.env = gym.make(task, max_episode_steps=max_episode_steps)
+        self.state_of = STATES[task]
+
+    def begin(self, observation: np.ndarray) -> None:
+        self.env.reset()
+        base: Any = self.env.unwrapped
+        if hasattr(base, "goal"):
+            base.goal = observation[4:6]
+        base.set_state(*self.state_of(observation))
+        np.testing.assert_allclose(base._get_obs(), observation, atol=1e-6)
+
+
+# Numbers of these that are positions and velocities; contact forces follow, in newtons
+IN_THREE_DIMENSIONS = {"Ant-v5": 13 + 14, "Humanoid-v5": 22 + 23, "HumanoidStandup-v5": 22 + 23}
+
+
+def tolerances(task: str, size: int) -> np.ndarray:
+    """Of each observed number. EnvPool's MuJoCo is older, and solves many contacts at once to other digits."""
+    if task not in IN_THREE_DIMENSIONS:
+        return np.full(size, 1e-9)
+    return np.where(np.arange(size) < IN_THREE_DIMENSIONS[task], 1e-2, 0.2)
+
+
+@every_task
+def test_transitions_are_gymnasium_s(task: str) -> None:
+    """Over ends of both kinds: what follows one is the start of an episode, and not a step that EnvPool takes for it."""
+    # Contacts in three dimensions soon make a large difference of a small one
+    steps, limit = 60, 5 if task in IN_THREE_DIMENSIONS else 25
+    env = pool(task, max_episode_steps=limit)
+    twins = [Twin(task, limit) for _ in range(env.num_envs)]
+    for twin, observation in zip(twins, env.reset(), strict=True):
+        twin.begin(observation)
+    tolerance = tolerances(task, env.observation_space.shape[0])
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(steps):
+        actions = random_actions(env, rng)
+        observations, rewards, dones, infos = env.step(actions)
+        for i, twin in enumerate(twins):
+            expected, reward, terminated, truncated, info = twin.env.step(actions[i])
+            found = infos[i]["terminal_observation"] if dones[i] else observations[i]
+            assert (np.abs(found - expected) <= tolerance * (1 + np.abs(expected))).all()
+            # SB3's rewards have 32 bits
+            np.testing.assert_allclose(rewards[i], reward, rtol=1e-6, atol=max(1e-6, tolerance[0]))
+            assert dones[i] == (terminated or truncated)
+            assert infos[i]["TimeLimit.truncated"] == (truncated and not terminated)
+            for name in info.keys() & infos[i].keys() - PLACES:
+                np.testing.assert_allclose(infos[i][name], info[name], rtol=1e-6, atol=tolerance[0], err_msg=name)
+            if dones[i]:
+                twin.begin(observations[i])
+                ends += 1
+    assert ends >= 2 * env.num_envs
+
+
+@every_task
+def test_infos_have_gymnasium_s_names(task: str) -> None:
+    found = pool(task)
+    found.reset()
+    expected = gym.make(task)
+    expected.reset()
+    gymnasium_s = set(expected.step(expected.action_space.sample())[4])
+    own = set(found.step(random_actions(found, np.random.default_rng(0)))[3][0])
+    # EnvPool has fewer, and for one task a term that is always 0
+    assert own - {"TimeLimit.truncated", "reward_alive"} <= gymnasium_s
+
+
+def test_an_end_in_the_step_of_the_time_limit_is_no_truncation() -> None:
+    """As gymnasium and SB3 have it; EnvPool by itself calls it one."""
+    env = pool("Hopper-v5", 1, max_episode_steps=1000)
+    env.reset()
+    n_steps = next(n for n in range(1, 200) if env.step(np.ones((1, 3)))[2][0])
+    again = pool("Hopper-v5", 1, max_episode_steps=n_steps)
+    again.reset()
+    *_, dones, infos = [again.step(np.ones((1, 3))) for _ in range(n_steps)][-1]
+    assert dones[0]
+    assert infos[0]["TimeLimit.truncated"] is False
+
+
+# Seeds
+
+
+def trajectory(env: VecEnv, n_steps: int = 20, seed: int | None = 0) -> np.ndarray:
+    if seed is not None:
+        env.seed(seed)
+    rng, first = np.random.default_rng(1), env.reset()
+    return np.stack([first, *[env.step(random_actions(env, rng))[0] for _ in range(n_steps)]])
+
+
+def test_a_seed_decides_the_trajectory_whatever_the_number_of_threads() -> None:
+    expected = trajectory(pool("Walker2d-v5", 3))
+    np.testing.assert_array_equal(trajectory(EnvPoolVecEnv(functions("Walker2d-v5", 3), 2)), expected)
+    env = pool("Walker2d-v5", 3)
+    trajectory(env, seed=5)
+    np.testing.assert_array_equal(trajectory(env), expected)
+
+
+def test_each_environment_has_a_seed_of_its_own() -> None:
+    wide, narrow = pool("Swimmer-v5", 3, seed=7), pool("Swimmer-v5", 1, seed=9)
+    starts = wide.reset()
+    assert len(np.unique(starts[:, 0])) == 3
+    np.testing.assert_array_equal(starts[2], narrow.reset()[0])
+
+
+def test_seeds_count_for_one_reset() -> None:
+    env = pool("Hopper-v5")
+    first, second = env.reset(), env.reset()
+    assert not np.array_equal(first, second)
+
+
+def test_without_a_seed_starts_differ() -> None:
+    first, second = (EnvPoolVecEnv(functions("Hopper-v5", 2), 1).reset() for _ in range(2))
+    assert not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("seed", [0, 2**31 - 2, 2**32 - 2])
+def test_large_seeds_are_taken(seed: int) -> None:
+    assert np.isfinite(pool("Hopper-v5", seed=seed).reset()).all()
+
+
+# What SB3 expects
+
+
+def test_what_was_returned_is_not_changed_by_later_steps() -> None:
+    env, rng = pool("HalfCheetah-v5", max_episode_steps=3), np.random.default_rng(0)
+    kept = [env.reset()]
+    copies = [kept[0].copy()]
+    for _ in range(10):
+        observations, rewards, dones, _ = env.step(random_actions(env, rng))
+        kept += [observations, rewards, dones]
+        copies += [observations.copy(), rewards.copy(), dones.copy()]
+    for array, copy in zip(kept, copies, strict=True):
+        np.testing.assert_array_equal(array, copy)
+
+
+def test_types_and_shapes_are_those_of_dummy_vec_env() -> None:
+    env_fns = functions("Ant-v5", 2, max_episode_steps=2)
+    results = []
+    for env in (EnvPoolVecEnv(env_fns, 1), DummyVecEnv(env_fns)):
+        observations = env.reset()
+        env.step(np.zeros((2, 8)))
+        results.append((observations, *env.step(np.zeros((2, 8)))))
+        assert (env.reset_infos[0].keys() & {"x_position"}) == {"x_position"}
+        assert env.get_attr("render_mode") == [None, None]
+        assert env.env_is_wrapped(Monitor) == [True, True]
+    for found, expected in zip(*[result[:4] for result in results], strict=True):
+        assert (found.shape, found.dtype) == (expected.shape, expected.dtype)
+    assert results[0][4][0].keys() == results[1][4][0].keys()
+
+
+def test_monitor_files_are_sb3_s(tmp_path: Path) -> None:
+    env = make_vec_env("Hopper-v5", 3, seed=0, monitor_dir=str(tmp_path), vec_env_cls=EnvPoolVecEnv)
+    env.reset()
+    expected, sums = [], np.zeros((2, 3))
+    for _ in range(60):
+        _, rewards, dones, infos = env.step(np.ones((3, 3)))
+        sums += rewards, np.ones(3)
+        for i in np.flatnonzero(dones):
+            assert infos[i]["episode"]["l"] == sums[1, i]
+            np.testing.assert_allclose(infos[i]["episode"]["r"], sums[0, i], rtol=1e-6)
+            expected.append(infos[i]["episode"]["r"])
+        sums[:, dones] = 0.0
+    assert len(expected) > 3
+    assert sorted(load_results(str(tmp_path))["r"]) == sorted(expected)
+    returns = [episode for episodes in env.env_method("get_episode_rewards") for episode in episodes]
+    np.testing.assert_allclose(sorted(returns), sorted(expected), atol=1e-6)
+
+
+def test_early_resets_are_refused_where_monitor_refuses_them() -> None:
+    env = EnvPoolVecEnv([lambda: Monitor(gym.make("Hopper-v5"), allow_early_resets=False)], 1)
+    env.reset()
+    env.step(np.zeros((1, 3)))
+    with pytest.raises(RuntimeError, match="early resets"):
+        env.reset()
+
+
+def test_an_agent_trains_and_is_evaluated_on_it() -> None:
+    env = VecNormalize(VecMonitor(EnvPoolVecEnv([lambda: gym.make("Hopper-v5")] * 4, 1)))
+    model = small_model(env, n_steps=64)
+    assert train_once(model)["train/is_line_search_success"] == 1.0
+    mean, _ = evaluate_policy(model, env, n_eval_episodes=3)
+    assert np.isfinite(mean)
+
+
+def test_numbers_that_blow_up_cut_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = pool("HalfCheetah-v5", 3, max_episode_steps=1000)
+    env.reset()
+    before, *_ = env.step(np.zeros((3, 6)))
+    results = env._pool.recv
+
+    def with_nan(*args: Any, **kwargs: Any) -> Any:
+        observations, *others = results(*args, **kwargs)
+        observations = observations.copy()
+        if len(observations) == 3:
+            observations[1, 4] = np.nan
+        return observations, *others
+
+    monkeypatch.setattr(env._pool, "recv", with_nan)
+    with pytest.warns(UserWarning, match="not finite"):
+        env.step_async(np.zeros((3, 6)))
+        observations, rewards, dones, infos = env.step_wait()
+    assert dones.tolist() == [False, True, False]
+    assert infos[1]["numerical_failure"] is True
+    assert infos[1]["TimeLimit.truncated"] is True
+    assert (infos[1]["reward_forward"], infos[1]["episode"]["l"], rewards[1]) == (0.0, 2, 0.0)
+    np.testing.assert_array_equal(infos[1]["terminal_observation"], before[1])
+    assert np.isfinite(observations).all()
+    assert env.numerical_failures == 1
+
+
+# Choice and refusals
+
+CHOICES: dict[str, tuple[Callable[[], gym.Env], bool]] = {
+    "task": (lambda: gym.make("HalfCheetah-v5"), True),
+    "monitored task": (lambda: Monitor(gym.make("HalfCheetah-v5")), True),
+    "with pictures": (lambda: gym.make("HalfCheetah-v5", render_mode="rgb_array", width=64), True),
+    "wrapped task": (lambda: ClipAction(gym.make("HalfCheetah-v5")), False),
+    "other arguments": (lambda: gym.make("HalfCheetah-v5", ctrl_cost_weight=0.2), False),
+    "other version": (lambda: gym.make("HalfCheetah-v4"), False),
+    "other environment": (lambda: gym.make("CartPole-v1"), False),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*out of date")
+@pytest.mark.parametrize("what", CHOICES)
+def test_tasks_of_gymnasium_as_they_are_registered_are_pooled(what: str) -> None:
+    make, pooled = CHOICES[what]
+    assert can_pool(make()) is pooled
+    assert type(batched_vec_env([make] * 2)) is (EnvPoolVecEnv if pooled else DummyVecEnv)
+    if not pooled:
+        with pytest.raises(ValueError, match="use DummyVecEnv"):
+            EnvPoolVecEnv([make])
+
+
+def test_without_envpool_all_is_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "envpool", None)
+    assert type(batched_vec_env(functions("HalfCheetah-v5", 2))) is DummyVecEnv
+    with pytest.raises(ImportError, match=r"sb3-gae\[fast\]"):
+        EnvPoolVecEnv(functions("HalfCheetah-v5", 2))
+
+
+def test_tasks_that_differ_are_refused() -> None:
+    with pytest.raises(ValueError, match="of one task, got HalfCheetah-v5, Walker2d-v5"):
+        EnvPoolVecEnv([lambda: gym.make("HalfCheetah-v5"), lambda: gym.make("Walker2d-v5")])
+
+
+def test_a_step_before_the_first_reset_is_refused() -> None:
+    with pytest.raises(gym.error.ResetNeeded):
+        pool("HalfCheetah-v5").step(np.zeros((2, 6)))
+
+
+def test_actions_of_the_wrong_shape_are_refused() -> None:
+    env = pool("HalfCheetah-v5")
+    env.reset()
+    with pytest.raises(ValueError, match=r"`actions` must have shape \(2, 6\), got \(2, 5\)"):
+        env.step(np.zeros((2, 5)))
+
+
+@pytest.mark.parametrize("name", ["state_vector", "set_state", "reset"])
+def test_methods_that_would_need_the_state_are_refused(name: str) -> None:
+    env = pool("HalfCheetah-v5")
+    env.reset()
+    with pytest.raises(NotImplementedError, match=f"'{name}'; use DummyVecEnv"):
+        env.env_method(name)
+
+
+def test_there_are_no_pictures() -> None:
+    with pytest.warns(UserWarning, match="no pictures; use DummyVecEnv"):
+        assert pool("HalfCheetah-v5").get_images() == [None, None]
+
+
+def test_closing_twice_does_no_harm() -> None:
+    env = pool("HalfCheetah-v5")
+    env.reset()
+    env.close()
+    env.close()
