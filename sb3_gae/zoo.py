@@ -20,7 +20,7 @@ from torch import nn
 
 from sb3_gae.trpo_gae import TRPOGAE
 from sb3_gae.zoo_hub_repairs import repair_hub_verbs
-from sb3_gae.zoo_keys import add_keys
+from sb3_gae.zoo_keys import METHODS_WITH_KEYS, add_keys
 
 if TYPE_CHECKING:
     import optuna
@@ -127,6 +127,9 @@ def _add_default_hyperparams(exp_manager: ModuleType) -> None:
     signature = inspect.signature(original)
     if not {"algo", "config"} <= signature.parameters.keys():
         raise UnsupportedZooError(f"{exp_manager.__name__}.{manager.__name__}(algo, config)")
+    for name in METHODS_WITH_KEYS:
+        if not callable(getattr(manager, name, None)):
+            raise UnsupportedZooError(f"{exp_manager.__name__}.{manager.__name__}.{name}")
 
     @functools.wraps(original)
     def init_with_our_default(*args: Any, **kwargs: Any) -> None:
@@ -136,8 +139,6 @@ def _add_default_hyperparams(exp_manager: ModuleType) -> None:
         original(*bound.args, **bound.kwargs)
 
     manager.__init__ = _mark_as_ours(init_with_our_default)
-    for name in ("create_envs", "_preprocess_hyperparams"):
-        _expect(manager, name, Callable)
     add_keys(manager)
 
 

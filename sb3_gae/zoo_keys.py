@@ -19,6 +19,9 @@ from sb3_gae.vec_env.choice import batched_vec_env
 
 BATCHED_ENVS, EVAL_FREQ = "batched_envs", "eval_freq"
 
+#: of rl-zoo3's ``ExperimentManager``, that read the keys
+METHODS_WITH_KEYS = ("_preprocess_hyperparams", "create_envs")
+
 # Of rl-zoo3's command line
 _DEFAULT_EVAL_FREQ = 25_000
 
@@ -29,7 +32,7 @@ def add_keys(manager: type) -> None:
 
     :param manager: rl-zoo3's ``ExperimentManager``
     """
-    preprocess, create_envs = manager._preprocess_hyperparams, manager.create_envs  # type: ignore[attr-defined]
+    preprocess, create_envs = (getattr(manager, name) for name in METHODS_WITH_KEYS)
 
     @functools.wraps(preprocess)
     def preprocess_without_our_keys(self: Any, hyperparams: dict[str, Any]) -> Any:

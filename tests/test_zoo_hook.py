@@ -185,6 +185,8 @@ UNKNOWN_LAYOUTS = {
     "hyperparams_opt.HYPERPARAMS_SAMPLER": KNOWN_LAYOUT | {"hyperparams_opt": "HYPERPARAMS_SAMPLER = None"},
     "exp_manager.ExperimentManager(algo, config)": KNOWN_LAYOUT
     | {"exp_manager": "import rl_zoo3.utils\nclass ExperimentManager:\n    def __init__(self, settings): pass"},
+    "exp_manager.ExperimentManager.create_envs": KNOWN_LAYOUT
+    | {"exp_manager": KNOWN_LAYOUT["exp_manager"].replace("create_envs", "make_envs")},
 }
 
 

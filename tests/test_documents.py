@@ -1,0 +1,44 @@
+"""What README and docs tell a user to type."""
+
+import re
+import sys
+from pathlib import Path
+
+import gymnasium
+import pytest
+
+from sb3_gae.envs import TASKS
+
+ROOT = Path(__file__).parent.parent
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+BLOCKS = {
+    f"{document.name}:{number}": code
+    for document in DOCUMENTS
+    for number, code in enumerate(re.findall(r"^```python\n(.*?)^```", document.read_text(), re.MULTILINE | re.DOTALL))
+}
+LINKS = [(document, link) for document in DOCUMENTS for link in re.findall(r"\]\((?!https?:)([^)#]+)", document.read_text())]
+
+
+def test_documents_have_code_and_links() -> None:
+    assert {name.split(":")[0] for name in BLOCKS} >= {"README.md", "tasks.md", "zoo.md"}
+    assert LINKS
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_code_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    # For a program that reads its command line
+    monkeypatch.setattr(sys, "argv", [name, "--help"])
+    known = {*gymnasium.registry, *TASKS}
+    try:
+        exec(compile(BLOCKS[name], name, "exec"), {"__name__": "__main__"})
+    except SystemExit as end:
+        assert end.code == 0
+    finally:
+        for task_id in set(gymnasium.registry) - known:
+            del gymnasium.registry[task_id]
+
+
+@pytest.mark.parametrize(("document", "link"), LINKS)
+def test_links_lead_somewhere(document: Path, link: str) -> None:
+    assert (document.parent / link).exists()
