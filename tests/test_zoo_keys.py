@@ -3,6 +3,7 @@
 import argparse
 import inspect
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor, load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize, is_vecenv_wrapped
 
-from sb3_gae import MujocoVecEnv, zoo
+from sb3_gae import EnvPoolVecEnv, MujocoVecEnv, zoo
 
 TASK, ORDINARY = "GaeCartPole-v0", "CartPole-v1"
 SETTINGS = {"n_timesteps": 64, "policy": "MlpPolicy", "n_envs": 2, "n_steps": 16, "policy_kwargs": "dict(net_arch=[8])"}
@@ -76,6 +77,13 @@ def kinds(experiment: ExperimentManager) -> tuple[type, type]:
 
 def test_environments_to_train_on_are_batched_and_those_to_evaluate_on_are_not(tmp_path: Path) -> None:
     assert kinds(manager(tmp_path, batched_envs=True)) == (MujocoVecEnv, DummyVecEnv)
+
+
+def test_gymnasium_s_mujoco_tasks_go_through_envpool_if_it_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("envpool")
+    assert kinds(manager(tmp_path, "HalfCheetah-v5", batched_envs=True)) == (EnvPoolVecEnv, DummyVecEnv)
+    monkeypatch.setitem(sys.modules, "envpool", None)
+    assert kinds(manager(tmp_path, "HalfCheetah-v5", batched_envs=True)) == (DummyVecEnv, DummyVecEnv)
 
 
 def test_nothing_is_batched_unasked(tmp_path: Path) -> None:
