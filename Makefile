@@ -5,7 +5,7 @@
 #   make check                     formatting, lint, types
 #   make format                    put formatting right
 #   make bench                     speed of an update beside sb3-contrib's
-#   make bench-full                also what the shipped settings reach (an hour)
+#   make bench-full                also speed of whole iterations, and what the shipped settings reach (hours)
 #   make clean                     remove .venv and what builds and tools left
 #   make PYTHON=python3.12 train   choose an interpreter
 
@@ -63,7 +63,9 @@ bench: $(STAMP)
 	$(IN_VENV) python benchmarks/update_speed.py $(ARGS)
 
 bench-full: bench
+	$(IN_VENV) python benchmarks/rollout_speed.py
 	$(IN_VENV) python benchmarks/first_results.py
+	$(IN_VENV) python benchmarks/paper_tasks.py
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks docs/_build
