@@ -296,8 +296,7 @@ def angle(first: np.ndarray, second: np.ndarray) -> float:
 
 def _all_end(chain: np.ndarray, terminal: np.ndarray) -> bool:
     """Whether every state can reach a terminal one."""
-    reaching, count = terminal.astype(bool), -1
-    while count != np.count_nonzero(reaching):
-        count = np.count_nonzero(reaching)
+    reaching = terminal.astype(bool)
+    for _ in range(len(chain)):
         reaching = reaching | (chain @ reaching.astype(np.float64) > 0.0)
     return bool(reaching.all())

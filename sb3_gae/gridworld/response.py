@@ -2,8 +2,8 @@ r"""
 How the reward of a step follows from an action l steps before it, exactly (paper, section 4).
 
 The response function :math:`\chi(l; s,a) = E[r_{t+l}|s_t=s, a_t=a] - E[r_{t+l}|s_t=s]` splits the advantage by delay:
-:math:`A^{\pi,\gamma}(s,a) = \sum_l \gamma^l \chi(l; s,a)`. For rewards shaped by :math:`V`, which are
-the residuals :math:`\delta`, the same sum gives the same advantage, but if :math:`V = V^{\pi,\gamma}` all of it comes at l = 0.
+:math:`A^{\pi,\gamma}(s,a) = \sum_l \gamma^l \chi(l; s,a)`. For rewards shaped by :math:`V`, which are the residuals
+:math:`\delta`, the same sum gives the same advantage, but if :math:`V = V^{\pi,\gamma}` all of it comes at l = 0.
 """
 
 import numpy as np
