@@ -59,13 +59,12 @@ def value_errors(
     :param mask: which steps belong to the batch, None for all, shape (T, N)
     :return: see :class:`ValueErrors`
     """
-    wide = [np.asarray(array, dtype=np.float64) for array in (rewards, values, next_values)]
+    rewards, values, next_values = (np.asarray(array, dtype=np.float64) for array in (rewards, values, next_values))
     belongs = np.ones_like(dones, dtype=bool) if mask is None else mask
-    deltas = td_residuals(*wide, gamma)
+    deltas = td_residuals(rewards, values, next_values, gamma)
     residuals = generalized_advantages(deltas, dones, gamma, 1.0)[belongs]
-    values = wide[1][belongs]
     return ValueErrors(
-        explained_variance=explained_variance(values, values + residuals),
+        explained_variance=explained_variance(values[belongs], values[belongs] + residuals),
         monte_carlo_error=float(np.square(residuals).mean()),
         td_error=float(np.square(deltas[belongs]).mean()),
     )

@@ -89,8 +89,8 @@ def lambda_errors(
     """
     _check_factors("lambdas", lambdas)
     gamma = _checked_gamma(rollout_buffer, gamma)
-    arrays = [np.asarray(array, dtype=np.float64) for array in _td_arrays(rollout_buffer)]
-    advantages = advantage_grid(*arrays, rollout_buffer.dones, [gamma], [*lambdas, 1.0])[0]
+    rewards, values, next_values = _td_arrays(rollout_buffer)
+    advantages = advantage_grid(rewards, values, next_values, rollout_buffer.dones, [gamma], [*lambdas, 1.0])[0]
     sums, groups = _gradient_sums(policy, rollout_buffer, advantages, n_groups)
     errors = gradient_errors(sums, np.bincount(groups))
     bias, variance, norm = (Estimate(*(array[:-1] for array in each)) for each in errors)
@@ -115,7 +115,7 @@ def policy_gradient_value_error(
     Of an error :math:`e = V - V^{\pi,\gamma}`, GAE's expected gradient keeps
     :math:`\gamma(1-\lambda)\sum_l(\gamma\lambda)^l E[\nabla_\theta\log\pi(a_t|s_t)\,e(s_{t+l+1})]`: only what the action has a
     hand in. An error that is the same wherever the actions lead does no harm, however large. This is the bias squared
-    at :math:`\lambda = 0`, where it is largest at any rate in the first term, and is estimated as that.
+    at :math:`\lambda = 0`, and is estimated as that.
 
     :param policy: that collected the rollout, not updated since
     :param rollout_buffer: full
@@ -153,7 +153,7 @@ def gradient_response(
     """
     gamma = _checked_gamma(rollout_buffer, gamma)
     check_count("n_lags", n_lags)
-    rewards, values, next_values = (np.asarray(array, dtype=np.float64) for array in _td_arrays(rollout_buffer))
+    rewards, values, next_values = _td_arrays(rollout_buffer)
     deltas = td_residuals(rewards, values, next_values, gamma)
     dones, mask = rollout_buffer.dones, rollout_buffer.mask
     lagged, known = lagged_signal(rewards, dones, n_lags, mask)
@@ -178,7 +178,9 @@ def _gradient_sums(
 
 
 def _td_arrays(rollout_buffer: GAERolloutBuffer) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return rollout_buffer.rewards, rollout_buffer.values, rollout_buffer.next_values
+    arrays = rollout_buffer.rewards, rollout_buffer.values, rollout_buffer.next_values
+    rewards, values, next_values = (np.asarray(array, dtype=np.float64) for array in arrays)
+    return rewards, values, next_values
 
 
 def _checked_gamma(rollout_buffer: GAERolloutBuffer, gamma: float | None) -> float:
