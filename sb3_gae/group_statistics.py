@@ -10,7 +10,8 @@ noise dominates, falls by a factor :math:`\sqrt{2(G-1)/G}` with G groups, which 
 Shapes: ``G`` groups, ``K`` vectors (such as one for each :math:`\lambda`), ``P`` components. Weights are numbers of
 what the mean is to be taken over: steps, or episodes. Where the weights are fixed the estimates are unbiased; where
 they are random, as numbers of steps in whole episodes are, they are so up to terms of order 1/n like any ratio.
-Standard errors are those of the jackknife over groups.
+Standard errors are those of the jackknife over groups. For a squared norm that is lost in noise they are too large,
+by up to :math:`\sqrt2` (Efron & Stein 1981: the jackknife counts the quadratic part of a statistic twice).
 """
 
 from collections.abc import Callable

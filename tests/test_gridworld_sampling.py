@@ -23,7 +23,7 @@ factors = st.one_of(st.sampled_from([0.0, 1.0, 0.99]), st.floats(0.0, 1.0))
 
 def trajectory(episodes: Episodes, n: int) -> Trajectory:
     steps = episodes.mask[:, n]
-    states = episodes.states[steps, n].tolist() + [int(episodes.next_states[steps, n][-1])]
+    states = [*episodes.states[steps, n].tolist(), int(episodes.next_states[steps, n][-1])]
     return Trajectory(1.0, tuple(states), tuple(episodes.actions[steps, n].tolist()))
 
 

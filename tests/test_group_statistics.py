@@ -47,9 +47,10 @@ def test_weights_may_differ_between_vectors() -> None:
 
 
 @pytest.mark.parametrize("sizes", [[5] * 8, [2, 3, 4, 5, 6, 7, 8, 5]])
-def test_estimates_of_gaussian_vectors_are_unbiased_and_their_errors_honest(sizes: list[int]) -> None:
-    generator, n_batches = np.random.default_rng(0), 2000
-    mean, deviation, n = np.array([0.3, -0.1, 0.2]), np.array([1.0, 2.0, 0.5]), sum(sizes)
+@pytest.mark.parametrize("length", [0.3, 3.0])
+def test_estimates_of_gaussian_vectors_are_unbiased_and_their_errors_honest(sizes: list[int], length: float) -> None:
+    generator, n_batches = np.random.default_rng(0), 1000
+    mean, deviation, n = length * np.array([1.0, -0.3, 0.6]), np.array([1.0, 2.0, 0.5]), sum(sizes)
     samples = mean + deviation * generator.normal(size=(n_batches, n, 3))
     norms, variances = [], []
     for batch in samples:
@@ -59,7 +60,8 @@ def test_estimates_of_gaussian_vectors_are_unbiased_and_their_errors_honest(size
     for estimates, truth in ((norms, mean @ mean), (variances, deviation @ deviation / n)):
         values, errors = np.transpose(estimates)
         assert abs(values.mean() - truth) < 4.0 * values.std() / np.sqrt(n_batches)
-        assert np.sqrt(np.square(errors).mean()) == pytest.approx(values.std(), rel=0.2)
+        # Too large by no more than the root of 2, where noise dominates
+        assert 0.8 < np.sqrt(np.square(errors).mean()) / values.std() < 1.2 * (1.0 if length > 1.0 else np.sqrt(2.0))
 
 
 @pytest.mark.parametrize("n_groups", [2, 7])
