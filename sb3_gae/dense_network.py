@@ -108,27 +108,6 @@ class DenseNetwork:
         return result
 
     @th.no_grad()
-    def weighted_vjps(self, cotangents: th.Tensor, weights: th.Tensor) -> th.Tensor:
-        """
-        :meth:`vjp` for several weightings of the rows at once: one pass backward serves them all.
-
-        :param cotangents: one for each output, shape (B, n_out)
-        :param weights: factors of the rows of ``cotangents``, shape (K, B)
-        :return: in double precision across blocks, shape (K, n)
-        """
-        result = th.zeros(len(weights), self.n_parameters, dtype=th.float64)
-        for index, (block, factors) in enumerate(
-            zip(cotangents.split(_BLOCK_ROWS), weights.split(_BLOCK_ROWS, dim=1), strict=True)
-        ):
-            gradients: list[th.Tensor] = []
-            for layer, hidden, at_layer in self._backward(index, block):
-                weighted = factors[:, :, None] * at_layer
-                biases = [] if self.layers[layer][0].bias is None else [weighted.sum(1)]
-                gradients = [(weighted.transpose(1, 2) @ hidden).flatten(1), *biases, *gradients]
-            result += th.cat(gradients, dim=1).cpu().double()
-        return result
-
-    @th.no_grad()
     def gauss_newton_product(self, vector: th.Tensor, metric: Callable[[th.Tensor, slice], th.Tensor]) -> th.Tensor:
         r"""
         :math:`\sum_n J_n^\top M_n J_n v`.

@@ -10,9 +10,7 @@ from oracles import ACTION_SPACES, OF_IMAGES, double_policy, jacobian, training_
 from tabular_oracles import random_policy
 
 from sb3_gae import MlpPolicy, MultiInputPolicy
-from sb3_gae import dense_network as dense_network_module
 from sb3_gae import gradient_diagnostics as module
-from sb3_gae.dense_policy import has_dense_policy
 from sb3_gae.gradient_diagnostics import policy_gradients
 from sb3_gae.gridworld import episode_advantages, episode_gradients, gridworld, sample_episodes
 from sb3_gae.policy_step import policy_parameters
@@ -31,7 +29,6 @@ POLICIES: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("chunk_rows", [4096, 7])
 def test_equals_sums_of_single_gradients(name: str, chunk_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_CHUNK_ROWS", chunk_rows)
-    monkeypatch.setattr(dense_network_module, "_BLOCK_ROWS", 4)
     policy = double_policy(**POLICIES[name])
     batch = training_batch(policy, N_SAMPLES)
     parameters = policy_parameters(policy, batch)
@@ -59,20 +56,6 @@ def test_order_is_that_of_the_parameters_asked_for_and_nothing_is_left_behind(na
     turned = np.concatenate(np.split(forwards, sizes, axis=2)[::-1], axis=2)
     np.testing.assert_allclose(backwards, turned, rtol=1e-12)
     assert all(parameter.grad is None for parameter in policy.parameters())
-
-
-def test_mlps_take_the_short_way_and_part_of_the_parameters_the_long_one() -> None:
-    policy = double_policy(ACTION_SPACES["Box"])
-    batch = training_batch(policy, N_SAMPLES)
-    parameters = policy_parameters(policy, batch)
-    assert has_dense_policy(policy, parameters)
-    assert not has_dense_policy(policy, parameters[1:])
-    advantages = np.random.default_rng(0).normal(size=(2, N_SAMPLES))
-    whole, part = (
-        policy_gradients(policy, asked, batch.observations, batch.actions, advantages)
-        for asked in (parameters, parameters[1:])
-    )
-    np.testing.assert_allclose(part, whole[:, :, parameters[0].numel() :], rtol=1e-10, atol=1e-12)
 
 
 def test_a_table_of_logits_has_the_tabular_gradient() -> None:
