@@ -29,6 +29,26 @@ def test_value_errors_are_their_definitions(rollout: Rollout, gamma: float, mask
     )
 
 
+@pytest.mark.parametrize("gamma", [0.9, 1.0])
+def test_value_errors_of_the_gridworld_are_the_exact_ones_on_average(gamma: float) -> None:
+    policy = random_policy(gridworld(), 2)
+    values = np.where(policy.mdp.terminal, 0.0, np.random.default_rng(0).normal(size=25))
+    actual = []
+    for seed in range(40):
+        episodes = sample_episodes(policy, 100, np.random.default_rng(seed))
+        arrays = episodes.rewards, values[episodes.states], values[episodes.next_states], episodes.dones
+        actual.append(value_errors(*arrays, gamma, episodes.mask)[1:])
+    # Squared residuals, and returns less values, are squared advantages at the ends of lambda
+    exact = []
+    for gae_lambda in (1.0, 0.0):
+        moments = policy.gradient_moments(values, gamma, gae_lambda)
+        squares = policy.over_actions(moments.advantage_variance + np.square(moments.advantage_mean))
+        exact.append(policy.visits @ squares / policy.mean_length)
+    # A ratio of sums over random lengths is biased a little
+    limits = 4.0 * np.std(actual, axis=0) / np.sqrt(len(actual)) + 0.01 * np.array(exact)
+    assert (np.abs(np.mean(actual, axis=0) - exact) < limits).all()
+
+
 @given(st.integers(0, 1000), st.integers(1, 8), st.integers(1, 3), st.integers(1, 10), st.booleans())
 def test_lagged_signals_step_by_step(seed: int, n_steps: int, n_envs: int, n_lags: int, whole: bool) -> None:
     generator = np.random.default_rng(seed)

@@ -158,18 +158,20 @@ DICT = spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": spaces.Discrete(3)})
 
 
 @pytest.mark.parametrize(
-    ("policy", "env", "arguments"),
+    ("policy", "env_id", "n_envs", "arguments"),
     [
-        ("MlpPolicy", make_vec_env("CartPole-v1", 2, seed=0), {}),
-        ("MultiInputPolicy", AnySpacesEnv(DICT), {}),
-        ("MlpPolicy", make_vec_env("CartPole-v1", 2, seed=0), dict(n_steps=400, n_episodes=4)),
-        ("MlpPolicy", make_vec_env("Pendulum-v1", 4, seed=0), dict(use_sde=True)),
+        ("MlpPolicy", "CartPole-v1", 2, {}),
+        ("MultiInputPolicy", lambda: AnySpacesEnv(DICT), 1, {}),
+        ("MlpPolicy", "CartPole-v1", 2, dict(n_steps=400, n_episodes=4)),
+        ("MlpPolicy", "Pendulum-v1", 4, dict(use_sde=True)),
     ],
     ids=["MLP", "Dict", "whole episodes", "gSDE"],
 )
-def test_the_log_holds_every_quantity_for_every_lambda(policy: str, env: Any, arguments: dict[str, Any]) -> None:
+def test_the_log_holds_every_quantity_for_every_lambda(
+    policy: str, env_id: Any, n_envs: int, arguments: dict[str, Any]
+) -> None:
     arguments = dict(n_steps=64, policy_kwargs=SMALL, seed=0, device="cpu") | arguments
-    model = TRPOGAE(policy, env, **arguments)
+    model = TRPOGAE(policy, make_vec_env(env_id, n_envs, seed=0), **arguments)
     record = Record()
     model.learn(2 * model.n_steps, callback=[GradientDiagnosticsCallback(LAMBDAS, n_groups=4), record])
     assert record.logged
