@@ -19,10 +19,11 @@ def layered_mdp(seed: int, n_states: int = 5, n_actions: int = 2) -> TabularMDP:
     return TabularMDP(transitions, generator.normal(size=transitions.shape), start / start.sum(), terminal)
 
 
-def cyclic_mdp(seed: int, n_states: int = 5, n_actions: int = 3) -> TabularMDP:
-    """Every state can follow every other one; the last is terminal."""
+def cyclic_mdp(seed: int, n_states: int = 5, n_actions: int = 3, ending: float = 0.0) -> TabularMDP:
+    """Every state can follow every other one, itself among them; the last is terminal, and follows at least so often."""
     generator = np.random.default_rng(seed)
-    transitions = generator.dirichlet(np.ones(n_states), size=(n_states, n_actions))
+    transitions = (1.0 - ending) * generator.dirichlet(np.ones(n_states), size=(n_states, n_actions))
+    transitions[:, :, -1] += ending
     terminal = np.arange(n_states) == n_states - 1
     transitions[terminal] = 0.0
     start = np.where(terminal, 0.0, generator.uniform(size=n_states))
@@ -57,22 +58,24 @@ class Trajectory(NamedTuple):
         return result
 
 
-def trajectories_from(policy: TabularPolicy, states: tuple[int, ...], actions: tuple[int, ...] = ()) -> Iterator[Trajectory]:
-    """All ways on from a beginning, with probabilities given it."""
+def trajectories_from(
+    policy: TabularPolicy, states: tuple[int, ...], actions: tuple[int, ...] = (), max_steps: int = 1000
+) -> Iterator[Trajectory]:
+    """All ways on from a beginning, with probabilities given it; those that take more than ``max_steps`` are left out."""
     mdp, state = policy.mdp, states[-1]
     if mdp.terminal[state]:
         yield Trajectory(1.0, states, actions)
         return
-    for action in range(mdp.n_actions):
+    for action in range(mdp.n_actions) if len(actions) < max_steps else ():
         for following in np.flatnonzero(mdp.transitions[state, action]).tolist():
             chance = policy.probabilities[state, action] * mdp.transitions[state, action, following]
-            for rest in trajectories_from(policy, (*states, following), (*actions, action)):
+            for rest in trajectories_from(policy, (*states, following), (*actions, action), max_steps):
                 yield rest._replace(probability=rest.probability * chance)
 
 
-def all_trajectories(policy: TabularPolicy) -> list[Trajectory]:
+def all_trajectories(policy: TabularPolicy, max_steps: int = 1000) -> list[Trajectory]:
     return [
         trajectory._replace(probability=trajectory.probability * policy.mdp.start[state])
         for state in np.flatnonzero(policy.mdp.start).tolist()
-        for trajectory in trajectories_from(policy, (state,))
+        for trajectory in trajectories_from(policy, (state,), max_steps=max_steps)
     ]

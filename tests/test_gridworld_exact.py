@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from tabular_oracles import all_trajectories, cyclic_mdp, layered_mdp, random_policy, trajectories_from
+from tabular_oracles import Trajectory, all_trajectories, cyclic_mdp, layered_mdp, random_policy, trajectories_from
 
 from sb3_gae.gridworld import (
     TabularPolicy,
@@ -29,27 +29,48 @@ def random_values(policy: TabularPolicy, seed: int) -> np.ndarray:
 # --- Every trajectory ---
 
 
+def moments_by_enumeration(
+    policy: TabularPolicy, trajectories: list[Trajectory], values: np.ndarray, gamma: float, gae_lambda: float
+) -> tuple[np.ndarray, float]:
+    """Mean of the gradient, and trace of its covariance."""
+    chances = np.array([each.probability for each in trajectories])
+    gradients = np.array(
+        [each.gradient(policy, each.advantages(policy.mdp, values, gamma, gae_lambda)) for each in trajectories]
+    )
+    mean = np.einsum("n,nsa->sa", chances, gradients)
+    return mean, float(chances @ np.square(gradients - mean).sum(axis=(1, 2)))
+
+
 @given(seeds, factors, factors)
 @example(0, 1.0, 1.0)
 @example(0, 0.0, 0.0)
 def test_moments_of_the_gradient_are_those_over_all_trajectories(seed: int, gamma: float, gae_lambda: float) -> None:
     policy = random_policy(layered_mdp(seed), seed)
-    values = random_values(policy, seed)
-    trajectories = all_trajectories(policy)
-    chances = np.array([each.probability for each in trajectories])
-    gradients = np.array(
-        [each.gradient(policy, each.advantages(policy.mdp, values, gamma, gae_lambda)) for each in trajectories]
-    ).reshape(len(chances), -1)
-    mean = chances @ gradients
-    assert chances.sum() == pytest.approx(1.0)
+    values, trajectories = random_values(policy, seed), all_trajectories(policy)
+    assert sum(each.probability for each in trajectories) == pytest.approx(1.0)
+    mean, variance = moments_by_enumeration(policy, trajectories, values, gamma, gae_lambda)
     moments = policy.gradient_moments(values, gamma, gae_lambda)
-    np.testing.assert_allclose(moments.mean.ravel(), mean, atol=1e-12)
-    np.testing.assert_allclose(policy.expected_gradient(values, gamma, gae_lambda).ravel(), mean, atol=1e-12)
-    assert moments.variance == pytest.approx(chances @ np.square(gradients - mean).sum(axis=1), abs=1e-11)
+    np.testing.assert_allclose(moments.mean, mean, atol=1e-12)
+    np.testing.assert_allclose(policy.expected_gradient(values, gamma, gae_lambda), mean, atol=1e-12)
+    assert moments.variance == pytest.approx(variance, abs=1e-11)
     curve = policy.lambda_curve(values, gamma, [gae_lambda])
     assert curve.variance[0] == moments.variance
     truth = policy.true_gradient(gamma)
-    assert curve.bias_squared[0] == pytest.approx(np.square(mean - truth.ravel()).sum(), abs=1e-12)
+    assert curve.bias_squared[0] == pytest.approx(np.square(mean - truth).sum(), abs=1e-12)
+
+
+@given(seeds, factors, factors)
+@example(0, 1.0, 1.0)
+@settings(max_examples=8)
+def test_moments_hold_where_states_are_visited_again(seed: int, gamma: float, gae_lambda: float) -> None:
+    # Few go on for long, and a later visit shares its logits with an earlier one
+    policy = random_policy(cyclic_mdp(seed, n_states=3, n_actions=2, ending=0.95), seed)
+    values, trajectories = random_values(policy, seed), all_trajectories(policy, max_steps=6)
+    assert 1.0 - sum(each.probability for each in trajectories) < 2e-8
+    mean, variance = moments_by_enumeration(policy, trajectories, values, gamma, gae_lambda)
+    moments = policy.gradient_moments(values, gamma, gae_lambda)
+    np.testing.assert_allclose(moments.mean, mean, atol=1e-6)
+    assert moments.variance == pytest.approx(variance, abs=2e-5)
 
 
 @given(seeds, factors, factors)

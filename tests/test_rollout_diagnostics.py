@@ -14,7 +14,16 @@ from stable_baselines3.common.env_util import make_vec_env
 from tabular_oracles import random_policy
 
 from sb3_gae import TRPOGAE, GAERolloutBuffer, GradientDiagnosticsCallback, MlpPolicy
-from sb3_gae.gridworld import Episodes, TabularPolicy, gridworld, lagged_gradients, sample_episodes
+from sb3_gae.gridworld import (
+    Episodes,
+    TabularPolicy,
+    episode_advantages,
+    episode_gradients,
+    gridworld,
+    lagged_gradients,
+    sample_episodes,
+)
+from sb3_gae.group_statistics import gradient_errors
 from sb3_gae.rollout_diagnostics import gradient_response, lambda_errors, policy_gradient_value_error
 
 LAMBDAS = (0.0, 0.9, 1.0)
@@ -96,6 +105,33 @@ def test_variance_is_that_between_rollouts() -> None:
         gradients.append(gradient.double().numpy().ravel())
     between = np.square(gradients - np.mean(gradients, axis=0)).sum() / (n_batches - 1)
     np.testing.assert_allclose(np.mean(errors), between, rtol=0.15)
+
+
+def test_errors_are_those_of_the_mean_over_steps_whatever_the_sizes_of_the_groups() -> None:
+    table = random_policy(gridworld(), 7)
+    policy, values = torch_policy(table), table.values(GAMMA)
+    clipped = False
+    for seed in range(10):
+        episodes = sample_episodes(table, 5, np.random.default_rng(seed))
+        actual = lambda_errors(policy, buffer_of(episodes, values), LAMBDAS, n_groups=3)
+        gradients = np.stack(
+            [episode_gradients(table, episodes, episode_advantages(table, episodes, values, GAMMA, each)) for each in LAMBDAS],
+            axis=1,
+        ).reshape(5, len(LAMBDAS), -1)
+        sums = np.stack([gradients[group::3].sum(axis=0) for group in range(3)])
+        steps = np.array([episodes.mask[:, group::3].sum() for group in range(3)])
+        expected = gradient_errors(sums, steps)
+        scale = 1e-5 * actual.variance.max()
+        np.testing.assert_allclose(actual.bias_squared, expected.bias_squared.value, atol=scale)
+        np.testing.assert_allclose(actual.bias_squared_error, expected.bias_squared.standard_error, atol=scale)
+        np.testing.assert_allclose(actual.variance, expected.variance.value, atol=scale)
+        np.testing.assert_allclose(actual.variance_error, expected.variance.standard_error, atol=scale)
+        np.testing.assert_allclose(actual.squared_norm, expected.squared_norm.value, atol=scale)
+        # A squared norm is not negative, though its estimate may be
+        positive = np.maximum(expected.bias_squared.value, 0.0)
+        np.testing.assert_allclose(actual.squared_error, positive + expected.variance.value, atol=scale)
+        clipped |= bool((expected.bias_squared.value < -scale).any())
+    assert clipped
 
 
 def test_exact_values_gather_the_response_at_lag_zero_and_have_no_error() -> None:
@@ -197,6 +233,15 @@ def test_training_is_the_same_with_and_without() -> None:
 
     with_it, without = train(GradientDiagnosticsCallback(LAMBDAS)), train(None)
     assert all(th.equal(with_it[name], value) for name, value in without.items())
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_the_policy_is_left_in_the_mode_that_it_was_in(training: bool) -> None:
+    callback = GradientDiagnosticsCallback(LAMBDAS)
+    model = TRPOGAE("MlpPolicy", "CartPole-v1", n_steps=64, policy_kwargs=SMALL, seed=0, device="cpu").learn(64, callback)
+    model.policy.set_training_mode(training)
+    callback.on_rollout_end()
+    assert model.policy.training == training
 
 
 def test_a_rollout_of_a_single_trajectory_is_left_out() -> None:
