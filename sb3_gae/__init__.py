@@ -5,12 +5,13 @@ The paper: Schulman et al., High-Dimensional Continuous Control Using Generalize
 arXiv 1506.02438.
 """
 
-from sb3_gae.callbacks import LambdaSweepCallback
+from sb3_gae.callbacks import GradientDiagnosticsCallback, LambdaSweepCallback
 from sb3_gae.envs import register_tasks
 from sb3_gae.errors import NumericalError
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gae.presets import CARTPOLE_NETWORKS, LOCOMOTION_NETWORKS, PAPER_VALUE_FIT
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer, LambdaSweep
+from sb3_gae.rollout_diagnostics import LambdaErrors
 from sb3_gae.trpo_gae import TRPOGAE
 from sb3_gae.vec_env import EnvPoolVecEnv, MujocoVecEnv
 
@@ -27,6 +28,8 @@ __all__ = [
     "EnvPoolVecEnv",
     "GAEDictRolloutBuffer",
     "GAERolloutBuffer",
+    "GradientDiagnosticsCallback",
+    "LambdaErrors",
     "LambdaSweep",
     "LambdaSweepCallback",
     "MlpPolicy",

@@ -1,10 +1,15 @@
 """Callbacks for training."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_gae.checks import check_count
 from sb3_gae.rollout_buffer import GAERolloutBuffer, LambdaSweep
+from sb3_gae.rollout_diagnostics import LambdaErrors, has_several_trajectories, lambda_errors
 
 #: the values of the paper's cart-pole figure
 PAPER_LAMBDAS = (0.0, 0.36, 0.68, 0.84, 0.92, 0.96, 0.98, 0.99, 1.0)
@@ -32,11 +37,81 @@ class LambdaSweepCallback(BaseCallback):
         return True
 
     def _on_rollout_end(self) -> None:
-        rollout_buffer = self.locals["rollout_buffer"]
-        if not isinstance(rollout_buffer, GAERolloutBuffer):
-            raise TypeError(f"LambdaSweepCallback needs a sb3_gae.GAERolloutBuffer, got {type(rollout_buffer).__name__}.")
-        self.sweep = rollout_buffer.lambda_sweep(self.lambdas, self.gamma)
-        for quantity, values in self.sweep._asdict().items():
-            if quantity != "gae_lambda":
-                for gae_lambda, value in zip(self.lambdas, values, strict=True):
-                    self.logger.record(f"sweep/{quantity}/lambda_{gae_lambda:g}", float(value))
+        self.sweep = _rollout_buffer(self).lambda_sweep(self.lambdas, self.gamma)
+        _log(self, "sweep", self.sweep, self.lambdas)
+
+
+class GradientDiagnosticsCallback(BaseCallback):
+    r"""
+    Logs, after a rollout, how far the policy gradient is off with each :math:`\lambda`: bias, variance and their sum.
+
+    Estimated from the rollout itself, see :func:`~sb3_gae.rollout_diagnostics.lambda_errors`, with the policy that
+    collected it. A single rollout says little; average the curves over several. A rollout of a single trajectory is left out.
+
+    Keys are ``gradient/<quantity>/lambda_<value>``, the quantities those of :class:`~sb3_gae.LambdaErrors`.
+    The estimates of the last rollout that had any are in ``self.errors``.
+
+    :param lambdas: weights of longer estimates, each in [0, 1]
+    :param every: rollouts from one estimate to the next, the first rollout being the first
+    :param n_groups: of trajectories to compare; more than 16 lower the noise little
+    :param gamma: discount factor, None for the one in training
+    :param verbose: as for SB3's callbacks
+    :raises ValueError: if a number is out of range
+    """
+
+    def __init__(
+        self,
+        lambdas: Sequence[float] = PAPER_LAMBDAS,
+        every: int = 1,
+        n_groups: int = 16,
+        gamma: float | None = None,
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        check_count("every", every)
+        check_count("n_groups", n_groups, low=2)
+        self.lambdas = tuple(lambdas)
+        self.every = every
+        self.n_groups = n_groups
+        self.gamma = gamma
+        self.errors: LambdaErrors | None = None
+        self._n_rollouts = 0
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        rollout_buffer = _rollout_buffer(self)
+        due, self._n_rollouts = self._n_rollouts % self.every == 0, self._n_rollouts + 1
+        if not due or not has_several_trajectories(rollout_buffer):
+            return
+        policy = self.model.policy
+        assert isinstance(policy, ActorCriticPolicy)
+        with _evaluation_mode(policy):
+            self.errors = lambda_errors(policy, rollout_buffer, self.lambdas, self.gamma, self.n_groups)
+        _log(self, "gradient", self.errors, self.lambdas)
+
+
+def _rollout_buffer(callback: BaseCallback) -> GAERolloutBuffer:
+    rollout_buffer = callback.locals["rollout_buffer"]
+    if not isinstance(rollout_buffer, GAERolloutBuffer):
+        name = type(callback).__name__
+        raise TypeError(f"{name} needs a sb3_gae.GAERolloutBuffer, got {type(rollout_buffer).__name__}.")
+    return rollout_buffer
+
+
+def _log(callback: BaseCallback, group: str, curves: Any, lambdas: Sequence[float]) -> None:
+    for quantity, values in curves._asdict().items():
+        if quantity != "gae_lambda":
+            for gae_lambda, value in zip(lambdas, values, strict=True):
+                callback.logger.record(f"{group}/{quantity}/lambda_{gae_lambda:g}", float(value))
+
+
+@contextmanager
+def _evaluation_mode(policy: ActorCriticPolicy) -> Iterator[None]:
+    training = policy.training
+    policy.set_training_mode(False)
+    try:
+        yield
+    finally:
+        policy.set_training_mode(training)
