@@ -5,7 +5,6 @@ import io
 import time
 from argparse import Namespace
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from rl_zoo3.exp_manager import ExperimentManager
@@ -13,26 +12,10 @@ from stable_baselines3.common.utils import set_random_seed
 
 import sb3_gae.zoo
 from sb3_gae.sweep.grid import Cell
+from sb3_gae.sweep.plan import Options
 from sb3_gae.sweep.recorder import Recorder, Row
 from sb3_gae.sweep.settings import as_json
 from sb3_gae.trpo_gae import TRPOGAE
-
-
-@dataclass(frozen=True)
-class Options:
-    """
-    How cells are run, whatever they are.
-
-    :param conf_file: settings file; None for the shipped one
-    :param gym_packages: modules that register environments
-    :param threads: of PyTorch and of the physics, for each process
-    :param device: of PyTorch
-    """
-
-    conf_file: str | None = None
-    gym_packages: tuple[str, ...] = ()
-    threads: int = 1
-    device: str = "auto"
 
 
 class _Manager(ExperimentManager):

@@ -3,8 +3,8 @@
 import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple, Self
 
 from sb3_gae.checks import check_count, check_number
 from sb3_gae.sweep.conditions import find_condition
@@ -52,6 +52,14 @@ class Cell:
     def key(self) -> str:
         """What makes the cell this one: the same on every machine and in every version of Python."""
         return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_key(cls, key: str) -> Self:
+        """
+        :param key: of a cell
+        :return: the cell
+        """
+        return cls(**json.loads(key))
 
     @property
     def hyperparameters(self) -> dict[str, Any]:
@@ -130,12 +138,3 @@ def overrides_as_json(overrides: Mapping[str, Any]) -> str:
             f"`-params` takes numbers, texts, lists and dictionaries ({error}); quote what is to be evaluated later, "
             "for example -params \"policy_kwargs:'dict(activation_fn=nn.ReLU)'\"."
         ) from None
-
-
-def with_size(cells: Iterable[Cell], iterations: int) -> list[Cell]:
-    """
-    :param cells: of a grid
-    :param iterations: batches of each run
-    :return: the same cells, longer or shorter
-    """
-    return [replace(cell, iterations=iterations) for cell in cells]

@@ -4,15 +4,15 @@ import multiprocessing
 import queue
 import threading
 import time
-from collections import Counter
 from typing import Any
 
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.ledger import Standing, Status
+from sb3_gae.sweep.plan import Plan
 from sb3_gae.sweep.progress import Progress
 from sb3_gae.sweep.settings import check_overrides, check_tasks, import_packages, shipped_settings
 from sb3_gae.sweep.study import SweepStudy
-from sb3_gae.sweep.worker import Plan, StopRequest, work, work_as_process
+from sb3_gae.sweep.worker import StopRequest, work, work_as_process
 
 #: seconds between looks at the storage for the progress bar
 _LOOK_EVERY = 2.0
@@ -67,22 +67,14 @@ def run_plan(plan: Plan, jobs: int = 1, *, retry_failed: bool = False, progress:
     return standings_of(study, plan)
 
 
-def standings_of(study: SweepStudy, plan: Plan) -> dict[str, Standing]:
+def standings_of(study: SweepStudy | None, plan: Plan) -> dict[str, Standing]:
     """
-    :param study: of the sweep
+    :param study: of the sweep; None if it has not begun
     :param plan: whose cells matter
     :return: where each cell of the plan stands, by its key
     """
-    table = study.standings()
+    table = {} if study is None else study.standings()
     return {cell.key: table.get(cell.key, Standing(Status.MISSING, None, 0)) for cell in plan.cells}
-
-
-def counts(table: dict[str, Standing]) -> Counter[Status]:
-    """
-    :param table: where cells stand
-    :return: how many there are of each kind
-    """
-    return Counter(standing.status for standing in table.values())
 
 
 def _run_here(plan: Plan, stop: StopRequest, bar: Progress) -> None:

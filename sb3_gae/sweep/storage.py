@@ -142,3 +142,18 @@ def without_password(location: str) -> str:
         return sqlalchemy.make_url(location).render_as_string(hide_password=True) if "://" in location else location
     except SQLAlchemyError:
         return location.split("://", 1)[0] + "://..."
+
+
+def holds(location: str, study: str) -> bool:
+    """
+    Look without making anything.
+
+    :param location: URL or path of a storage
+    :param study: name
+    :return: whether the storage is there and has the study
+    :raises SweepError: if it cannot be reached
+    """
+    if "://" not in location and not Path(location).exists():
+        return False
+    with storage_errors(location):
+        return study in optuna.get_all_study_names(open_storage(location, create=False))

@@ -6,17 +6,15 @@ import signal
 import time
 import traceback
 import warnings
-from dataclasses import dataclass
 from types import FrameType
 from typing import Any
 
 import torch as th
 
 from sb3_gae.sweep.errors import SweepError
-from sb3_gae.sweep.experiment import Experiment, Options
-from sb3_gae.sweep.grid import Cell
+from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.ledger import Outcome
-from sb3_gae.sweep.liveness import SILENT_AFTER
+from sb3_gae.sweep.plan import Options, Plan
 from sb3_gae.sweep.provenance import provenance
 from sb3_gae.sweep.recorder import Row
 from sb3_gae.sweep.settings import import_packages
@@ -26,25 +24,6 @@ from sb3_gae.sweep.study import Claim, SweepStudy, TakenOverError
 _STORE_EVERY = 5.0
 #: seconds between signs of life, far below what counts as silence
 _BEAT_EVERY = 60.0
-
-
-@dataclass(frozen=True)
-class Plan:
-    """
-    What a command asks for; every worker of every machine gets the same.
-
-    :param name: of the sweep
-    :param location: of the storage
-    :param cells: of the grid
-    :param options: how they are run
-    :param silent_after: seconds after which a silent machine's cell is taken over
-    """
-
-    name: str
-    location: str | None
-    cells: tuple[Cell, ...]
-    options: Options
-    silent_after: float = SILENT_AFTER
 
 
 class StoppedError(Exception):
