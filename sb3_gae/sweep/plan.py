@@ -80,8 +80,8 @@ def make_cells(
         seeds, iterations = chosen.seeds if seeds is None else seeds, iterations or chosen.iterations
         hyperparams = {**chosen.overrides, **(hyperparams or {})}
     else:
-        for name, value in {"env": tasks, "gammas": gammas, "seeds": seeds, "iterations": iterations}.items():
-            if value is None:
+        for name, needed in {"env": tasks, "gammas": gammas, "seeds": seeds, "iterations": iterations}.items():
+            if needed is None:
                 raise SweepError(f"`{name}` is missing; give it, or a preset.")
         curves = product(["trust_region"] if conditions is None else conditions, gammas or (), lambdas or ())
     which = range(seeds) if isinstance(seeds, int) else list(seeds or ())

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.figures.style import RETURN_LABEL, line_styles, new_figure
@@ -31,9 +32,10 @@ def curves_figure(table: pd.DataFrame) -> Figure:
         result = estimate(one.returns[:, known])
         axes.plot(iterations, result.iqm, label=label_of(one.curve, series), zorder=3, **style)
         axes.fill_between(iterations, result.low, result.high, color=style["color"], alpha=0.13, linewidth=0)
-    axes.set_xlabel("iteration")
+    axes.set_xlabel("iteration (batch)")
     axes.set_ylabel(RETURN_LABEL)
     axes.set_xlim(1, max(2, n_iterations))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.25)
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
     axes.set_title(f"{what(table, series)}\nIQM over {seeds(series)}, bands: 95 % bootstrap intervals")

@@ -56,7 +56,8 @@ def _rising(series: list[Series]) -> list[Series]:
 
 
 def _draw_u(axes: Axes, results: list[Estimate], top: float, first: int) -> None:
-    iqm, low, high = (top - np.array([float(result[part][0]) for result in results]) for part in range(3))
+    losses: np.ndarray = top - np.array([[float(part[0]) for part in result] for result in results])
+    iqm, low, high = losses.T
     axes.fill_between(range(len(results)), high, low, color="C0", alpha=0.16, linewidth=0)
     axes.plot(range(len(results)), iqm, "o-", color="C0", zorder=3, label="value function and λ")
     axes.plot([first], [iqm[first]], "o", color=RED, markersize=8, zorder=4, linestyle="none", label="best λ")

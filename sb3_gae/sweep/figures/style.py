@@ -23,7 +23,7 @@ STYLE: Any = {
     "svg.hashsalt": "sb3-gae",
 }
 
-RETURN_LABEL = "mean return of the iteration's episodes"
+RETURN_LABEL = "mean return of an iteration's episodes (sum of rewards)"
 #: of conditions without λ
 GREY = "0.25"
 #: of the best
@@ -40,22 +40,28 @@ def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
     return figure, figure.add_subplot()
 
 
+_DASHES = ("-", "--", "-.", ":")
+
+
 def line_styles(series: Sequence[Series]) -> list[dict[str, Any]]:
     """
     :param series: in the order in which they are drawn
-    :return: for each: colours in that order, a condition without λ in grey; dashes tell γ apart
+    :return: for each: a condition without λ in grey; colours tell λ apart and dashes γ, or colours all where there are
+        more γ than dashes, or several conditions
     """
-    n_with_lambda = sum(one.curve.gae_lambda is not None for one in series)
-    shades = iter(colormaps["turbo"](np.linspace(0.06, 0.92, max(n_with_lambda, 1))))
-    gammas = sorted({one.curve.gamma for one in series if one.curve.gae_lambda is not None}, reverse=True)
-    dashes = ("-", "--", "-.", ":")
+    of_lambda = [one.curve for one in series if one.curve.gae_lambda is not None]
+    gammas = sorted({curve.gamma for curve in of_lambda}, reverse=True)
+    by_lambda = len(gammas) <= len(_DASHES) and len({curve.condition for curve in of_lambda}) == 1
+    hues = list(dict.fromkeys(curve.gae_lambda if by_lambda else curve for curve in of_lambda))
+    shades = colormaps["turbo"](np.linspace(0.06, 0.92, max(len(hues), 1)))
     styles: list[dict[str, Any]] = []
     for one in series:
         if one.curve.gae_lambda is None:
             styles.append({"color": GREY, "linestyle": (0, (5, 2)), "linewidth": 2.0})
         else:
-            dash = dashes[gammas.index(one.curve.gamma) % len(dashes)]
-            styles.append({"color": next(shades), "linestyle": dash, "linewidth": 1.7})
+            shade = shades[hues.index(one.curve.gae_lambda if by_lambda else one.curve)]
+            dash = _DASHES[gammas.index(one.curve.gamma)] if by_lambda else "-"
+            styles.append({"color": shade, "linestyle": dash, "linewidth": 1.7})
     return styles
 
 
