@@ -153,9 +153,11 @@ def test_a_journal_survives_a_write_that_was_cut_off(journal: str, torn: str) ->
 def test_a_lock_that_was_left_behind_does_not_stop_the_sweep_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     study = SweepStudy("s", "folder/sweep.journal")
-    study.storage._backend._lock.grace_period = 0.2  # type: ignore[attr-defined]
-    # As a process that was killed leaves it; from a path that is not absolute it would be a dangling link
-    Path("folder/sweep.journal.lock").symlink_to(Path("folder/sweep.journal").absolute())
+    lock = study.storage._backend._lock  # type: ignore[attr-defined]
+    lock.grace_period = 0.2
+    lock.acquire()
+    # A dangling link would never be seen to grow old
+    assert Path("folder/sweep.journal.lock").exists()
     study.enqueue(CELLS[:1])
     assert len(study.trials()) == 1
 

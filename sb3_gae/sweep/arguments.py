@@ -6,7 +6,7 @@ from typing import Any
 from rl_zoo3.utils import StoreDict
 
 from sb3_gae.sweep.conditions import CONDITIONS
-from sb3_gae.sweep.figures import FIGURES
+from sb3_gae.sweep.figures import KINDS
 from sb3_gae.sweep.presets import PRESETS
 
 _EXAMPLES = """examples:
@@ -70,7 +70,7 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_figure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("kind", choices=list(FIGURES))
+    parser.add_argument("kind", choices=KINDS)
     _add_study(parser)
     parser.add_argument("--from", dest="source", metavar="FILE", help="an exported file, in place of a storage")
     parser.add_argument("-o", "--output", help="PNG or SVG file; without an ending both (default: logs/sweeps/NAME_KIND)")

@@ -1,5 +1,7 @@
 """The return as a function of λ, at one γ."""
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -36,7 +38,11 @@ def lambda_figure(table: pd.DataFrame, iteration: int | None = None) -> Figure:
     axes.set_xticks(range(len(series)), [f"{one.curve.gae_lambda:g}" for one in series])
     axes.set_xlabel("λ (evenly spaced, not to scale)")
     axes.set_ylabel(f"return lost against the best λ at iteration {iteration}")
-    right = axes.secondary_yaxis("right", functions=(lambda lost: top - lost, lambda value: top - value))
+
+    def below(value: Any) -> Any:
+        return top - value
+
+    right = axes.secondary_yaxis("right", functions=(below, below))
     right.set_ylabel(RETURN_LABEL)
     axes.grid(alpha=0.25)
     axes.legend(loc="best", fontsize=9)
