@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +30,12 @@ def results_of(study: SweepStudy) -> pd.DataFrame:
     :return: finished cells, with the columns of :data:`COLUMNS`, in the order of their trials
     """
     done = [standing.trial for standing in study.standings().values() if standing.status == Status.DONE]
-    tables = [_rows_of(trial, study.name) for trial in sorted(filter(None, done), key=lambda trial: trial.number)]
-    table = pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=list(COLUMNS))
-    return _typed(table)
+    rows = [row for trial in sorted(filter(None, done), key=lambda trial: trial.number) for row in _rows_of(trial, study.name)]
+    return _typed(pd.DataFrame(rows, columns=list(COLUMNS)))
 
 
-def _rows_of(trial: FrozenTrial, sweep: str) -> pd.DataFrame:
+def _rows_of(trial: FrozenTrial, sweep: str) -> Iterator[dict[str, Any]]:
     stored = trial.user_attrs
-    chunks = [stored[name] for name in sorted(stored) if name.startswith("rows:")]
-    table = pd.concat([pd.DataFrame(chunk) for chunk in chunks], ignore_index=True)
     constants: dict[str, Any] = {
         "format": FORMAT,
         "sweep": sweep,
@@ -48,7 +45,10 @@ def _rows_of(trial: FrozenTrial, sweep: str) -> pd.DataFrame:
         **{name: stored.get("provenance", {}).get(name, "") for name in PROVENANCE_COLUMNS},
         "settings": json.dumps(stored.get("settings", {}), sort_keys=True),
     }
-    return table.assign(**constants)
+    for name in sorted(name for name in stored if name.startswith("rows:")):
+        chunk = stored[name]
+        for values in zip(*chunk.values(), strict=True):
+            yield constants | dict(zip(chunk, values, strict=True))
 
 
 def read_results(path: str | Path) -> pd.DataFrame:
