@@ -175,6 +175,23 @@ def figure() -> None:
     print(f"wrote {FIGURE}")
 
 
+def run_all(pairs: list[tuple[str, int]], args: argparse.Namespace) -> list[str]:
+    """:return: what went wrong, a line for each run that did; the others are stored"""
+    failures = []
+    with ThreadPoolExecutor(args.jobs) as pool:
+        runs = {pool.submit(run, env, seed, args.steps, args.folder): f"{env}, seed {seed}" for env, seed in pairs}
+        for done in as_completed(runs):
+            try:
+                row, points = done.result()
+            except subprocess.CalledProcessError as error:
+                failures.append(f"{runs[done]}: exit status {error.returncode}, see output.txt in {args.folder}")
+                continue
+            store(CURVES, CURVE_COLUMNS, points)
+            store(RESULTS, COLUMNS, [row])
+            print(row, flush=True)
+    return failures
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", choices=list(TASKS), default=list(TASKS))
@@ -184,19 +201,16 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=Path("logs/paper_tasks"), help="where rl-zoo3 writes")
     parser.add_argument("--report", action="store_true", help="run nothing")
     args = parser.parse_args()
+    failures: list[str] = []
     if not args.report:
         known = {(row["env"], int(row["seed"])) for row in stored(RESULTS)}
         wanted = [(env, seed) for env in args.tasks for seed in args.seeds or TASKS[env].seeds]
         left = [pair for pair in wanted if pair not in known]
-        with ThreadPoolExecutor(args.jobs) as pool:
-            for done in as_completed([pool.submit(run, env, seed, args.steps, args.folder) for env, seed in left]):
-                row, points = done.result()
-                store(CURVES, CURVE_COLUMNS, points)
-                store(RESULTS, COLUMNS, [row])
-                print(row, flush=True)
+        failures = run_all(left, args)
     table()
     if stored(CURVES):
         figure()
+    sys.exit("".join(f"\n{failure}" for failure in failures) or None)
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ def check_count(name: str, value: Any, low: int = 1) -> None:
         raise ValueError(f"`{name}` must be a whole number of at least {low}, got {value!r}.")
 
 
-def check_choice(name: str, value: Any, choices: tuple[str, ...]) -> None:
+def check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
     """
     :param name: of the argument, for the message
     :param value: what was passed

@@ -29,6 +29,20 @@ class TerminalObservation(NamedTuple):
     observation: Observations
 
 
+class RolloutEnd(NamedTuple):
+    """
+    What a rollout leads on to, which is not among its steps.
+
+    :param terminal: where time limits struck
+    :param observations: after the last step, shape (N, ...), or a dictionary of such
+    :param dones: whether the last step ended an episode, shape (N,)
+    """
+
+    terminal: list[TerminalObservation]
+    observations: Observations
+    dones: np.ndarray
+
+
 def sample_actions(policy: ActorCriticPolicy, observations: Observations, step: int) -> np.ndarray:
     """
     :param policy: in evaluation mode
@@ -78,19 +92,13 @@ def terminal_observations(step: int, dones: np.ndarray, infos: list[dict[str, An
     return endings
 
 
-def evaluate_rollout(
-    policy: ActorCriticPolicy,
-    rollout_buffer: GAERolloutBuffer,
-    terminal: list[TerminalObservation],
-    last_observations: Observations,
-) -> th.Tensor:
+def evaluate_rollout(policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer, end: RolloutEnd) -> th.Tensor:
     """
     Give a full buffer its values and log-probabilities, computed for all of it at once.
 
     :param policy: in evaluation mode, as it was when the rollout was collected
     :param rollout_buffer: full
-    :param terminal: where time limits struck
-    :param last_observations: after the last step, shape (N, ...), or a dictionary of such
+    :param end: of the rollout
     :return: values of the last observations, shape (N,)
     :raises NumericalError: if a value or a log-probability is not finite
     """
@@ -106,8 +114,8 @@ def evaluate_rollout(
     values[mask], log_probs[mask] = evaluated.T
     check_finite_rollout("value", values)
     check_finite_rollout("log-probability", log_probs)
-    rollout_buffer.set_values(values, log_probs, _bootstrap_values(policy, terminal, mask.shape))
-    return _predict_values(policy, last_observations)
+    rollout_buffer.set_values(values, log_probs, _bootstrap_values(policy, end.terminal, mask.shape))
+    return _predict_values(policy, end.observations)
 
 
 def distribution_actions(action_space: spaces.Space, actions: th.Tensor) -> th.Tensor:

@@ -78,6 +78,8 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
     if values["curvature_samples"] is not None:
         check_count("curvature_samples", values["curvature_samples"], low=2)
     check_choice("vf_optimizer", values["vf_optimizer"], ("trust_region", "adam"))
+    check_choice("baseline", values["baseline"], ("value", "time"))
+    check_choice("value_fit_first", values["value_fit_first"], (False, True))
     _check_batch(values["n_steps"], values["n_envs"], values["sub_sampling_factor"], values["n_episodes"])
     _check_buffer_class(values["rollout_buffer_class"])
     if "value_lambda" in values["rollout_buffer_kwargs"]:

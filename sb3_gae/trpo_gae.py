@@ -22,6 +22,7 @@ from sb3_gae.batch import TrainingBatch, random_subset, standardized
 from sb3_gae.checks import check_finite_parameters, check_finite_rollout, check_finite_step
 from sb3_gae.collection import (
     Observations,
+    RolloutEnd,
     TerminalObservation,
     environment_actions,
     evaluate_rollout,
@@ -36,6 +37,7 @@ from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gae.policy_step import policy_parameters, policy_step
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
 from sb3_gae.saved_file import check_saved_file
+from sb3_gae.time_baseline import TimeBaseline
 from sb3_gae.trust_region import StepRecord, TrustRegionSettings
 from sb3_gae.update_summary import update_summary
 from sb3_gae.value_head import ValueHead
@@ -95,6 +97,11 @@ class TRPOGAE(OnPolicyAlgorithm):
     :param n_episodes: collect this many whole episodes of each environment, as the paper does for cart-pole, and use the
         steps of no others; ``n_steps`` is then the most that an environment takes, and should cover the longest
         episodes. None for batches of ``n_steps`` steps
+    :param baseline: what advantages are measured against: ``"value"``, the value function, or ``"time"``, the mean return at
+        each timestep over the batch's episodes, which is the paper's comparison without a value function (section 6.1).
+        With the latter there is no value fit, and ``gae_lambda`` and ``value_lambda`` have no effect
+    :param value_fit_first: whether to fit the value function before the policy step and compute the advantages anew, the
+        order that the paper warns of (section 5); for comparison
     :param foreign_arguments: arguments of PPO and A2C that have no meaning here; each warns and says what to use
     :raises ValueError: if an argument is outside its domain
     :raises TypeError: if an argument is unknown, or the rollout buffer is of another kind
@@ -146,6 +153,8 @@ class TRPOGAE(OnPolicyAlgorithm):
         normalize_value: bool = True,
         curvature_samples: int | None = 8_192,
         n_episodes: int | None = None,
+        baseline: str = "value",
+        value_fit_first: bool = False,
         **foreign_arguments: Any,
     ):
         super().__init__(
@@ -192,7 +201,10 @@ class TRPOGAE(OnPolicyAlgorithm):
         self.normalize_value = normalize_value
         self.curvature_samples = curvature_samples
         self.n_episodes = n_episodes
+        self.baseline = baseline
+        self.value_fit_first = value_fit_first
         self._numerical_failures = 0
+        self._time_baseline = TimeBaseline()
         if _init_setup_model:
             self._setup_model()
 
@@ -265,7 +277,8 @@ class TRPOGAE(OnPolicyAlgorithm):
 
         if self.n_episodes is not None:
             self._finish_episodes(rollout_buffer, quota)
-        self._complete_rollout(rollout_buffer, terminal, self._last_obs, self._last_episode_starts)
+        self._rollout_end = RolloutEnd(terminal, self._last_obs, self._last_episode_starts)
+        self._estimate_advantages(rollout_buffer)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
@@ -285,34 +298,32 @@ class TRPOGAE(OnPolicyAlgorithm):
                 stacklevel=2,
             )
 
-    def _complete_rollout(
-        self,
-        rollout_buffer: GAERolloutBuffer,
-        terminal: list[TerminalObservation],
-        last_obs: Observations,
-        last_dones: np.ndarray,
-    ) -> None:
-        """Values, advantages and targets of a full buffer, all with the value function of this iteration."""
+    def _estimate_advantages(self, rollout_buffer: GAERolloutBuffer) -> None:
+        """Values, advantages and targets of a full buffer, all with the value function as it is now."""
         rollout_buffer.gamma, rollout_buffer.gae_lambda = self.gamma, self.gae_lambda
         rollout_buffer.value_lambda = self.value_lambda
         if (head := self._value_head()) is not None and head.n_batches == 0:
             head.initialize_scale(rollout_buffer.to_torch(reward_returns(rollout_buffer)))
-        last_values = evaluate_rollout(self.policy, rollout_buffer, terminal, last_obs)
-        rollout_buffer.compute_returns_and_advantage(last_values, last_dones)
+        last_values = evaluate_rollout(self.policy, rollout_buffer, self._rollout_end)
+        if self.baseline == "time":
+            # The return less its mean: neither lambda has a part in it
+            rollout_buffer.gae_lambda, rollout_buffer.value_lambda = 1.0, None
+            last_values = th.as_tensor(self._time_baseline.fill(rollout_buffer, self._rollout_end.dones, self.gamma))
+        rollout_buffer.compute_returns_and_advantage(last_values, self._rollout_end.dones)
         check_finite_rollout("advantage", rollout_buffer.advantages)
         check_finite_rollout("value target", rollout_buffer.returns)
 
     def _value_head(self) -> ValueHead | None:
         """The layer whose scale follows the returns, if it is to."""
         head = getattr(self.policy, "value_net", None)
-        return head if self.normalize_value and isinstance(head, ValueHead) else None
+        return head if self.normalize_value and self.baseline == "value" and isinstance(head, ValueHead) else None
 
     def train(self) -> None:
         """
         Update policy and value function from the rollout buffer: the policy first, the value function last.
 
         The paper's reason (section 5): a value function fitted first would overfit the batch, and take the
-        residuals and with them the policy's gradient towards zero.
+        residuals and with them the policy's gradient towards zero. ``value_fit_first`` shows it.
 
         If anything goes wrong, policy and optimiser are left as they were before the call.
 
@@ -327,10 +338,15 @@ class TRPOGAE(OnPolicyAlgorithm):
         if not of_policy:
             raise ValueError("The action distribution depends on no trainable parameter; give the policy layers.")
         with all_or_nothing(self.policy):
-            policy_record = self._step_policy(batch, of_policy)
-            value_record = self._fit_value(batch, of_value)
+            if self.value_fit_first:
+                value_record = self._fit_value(batch, of_value)
+                self._estimate_advantages(self.rollout_buffer)
+                policy_record = self._step_policy(training_batch(self.rollout_buffer, self.action_space), of_policy)
+            else:
+                policy_record = self._step_policy(batch, of_policy)
+                value_record = self._fit_value(batch, of_value)
         self._n_updates += 1
-        self._log_update(policy_record, value_record)
+        self._log_update(policy_record, value_record, batch.value_targets)
 
     def _step_policy(self, batch: TrainingBatch, parameters: list[th.Tensor]) -> StepRecord:
         advantages = standardized(batch.advantages) if self.normalize_advantage else batch.advantages
@@ -349,6 +365,9 @@ class TRPOGAE(OnPolicyAlgorithm):
         return policy_step(self.policy, parameters, batch, advantages, settings, curvature_subset)
 
     def _fit_value(self, batch: TrainingBatch, parameters: list[th.Tensor]) -> ValueFitRecord:
+        if self.baseline == "time":
+            values = th.as_tensor(self.rollout_buffer.values[self.rollout_buffer.mask])
+            return ValueFitRecord([], values, values)
         head = self._value_head()
         # A head that is frozen, or that the policy depends on as well, keeps its bits
         movable = {id(parameter) for parameter in parameters}
@@ -368,8 +387,8 @@ class TRPOGAE(OnPolicyAlgorithm):
         curvature_subset = random_subset(len(batch), self.curvature_samples, self.device)
         return value_steps(self.policy, parameters, batch, settings, self.vf_steps, curvature_subset)
 
-    def _log_update(self, policy_record: StepRecord, value_record: ValueFitRecord) -> None:
-        for name, value in update_summary(policy_record, value_record, self.rollout_buffer).items():
+    def _log_update(self, policy_record: StepRecord, value_record: ValueFitRecord, value_targets: th.Tensor) -> None:
+        for name, value in update_summary(policy_record, value_record, value_targets).items():
             self.logger.record(f"train/{name}", value)
         if (head := self._value_head()) is not None:
             self.logger.record("train/value_scale", head.scale.item())
@@ -387,6 +406,9 @@ class TRPOGAE(OnPolicyAlgorithm):
         progress_bar: bool = False,
     ) -> Self:
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_rollout_end"]
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"

@@ -43,7 +43,7 @@ QUADRUPED_LEGS = ("front_left_leg", "back_left_leg", "back_right_leg", "front_ri
 FACTS = {
     "GaeCartPole-v0": Facts(4, 0.02, 1000, alive_bonus=1.0),
     "GaeBiped-v0": Facts(33, 0.01, 2000, BIPED_GEARS, 1e-5, 1e-5, ("right_thigh", "left_thigh"), 0.2, 0.8),
-    "GaeQuadruped-v0": Facts(29, 0.01, 2000, (150.0,) * 8, 1e-6, 1e-3, QUADRUPED_LEGS, 0.05, 0.2),
+    "GaeQuadruped-v0": Facts(29, 0.01, 2000, (60.0,) * 8, 1e-6, 1e-3, QUADRUPED_LEGS, 0.05, 0.2),
     "GaeBipedStandup-v0": Facts(33, 0.01, 2000, BIPED_GEARS, 1e-5),
 }
 CONTINUOUS = [task_id for task_id, facts in FACTS.items() if facts.gears]

@@ -57,9 +57,9 @@ class Quadruped(MujocoTask):
 
 class GaeQuadrupedEnv(MujocoTaskEnv):
     r"""
-    ``GaeQuadruped-v0``: a sphere on four two-joint legs is to run along x; at most 2 000 steps of 0.01 s.
+    ``GaeQuadruped-v0``: a sphere on four two-joint legs, 14.4 kg in all, is to run along x; at most 2 000 steps of 0.01 s.
 
-    **Actions**: Box(-1, 1, (8,)), parts of the largest torque of 150 N·m: hip and ankle of the front left, back left,
+    **Actions**: Box(-1, 1, (8,)), parts of the largest torque of 60 N·m: hip and ankle of the front left, back left,
     back right and front right leg.
 
     **Observations**: Box(-inf, inf, (29,)), positions then velocities.
