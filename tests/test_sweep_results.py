@@ -19,7 +19,7 @@ from sb3_gae.sweep.provenance import provenance
 from sb3_gae.sweep.recorder import COLUMNS
 from sb3_gae.sweep.results import rows_of_cells
 from sb3_gae.sweep.series import series_of
-from sb3_gae.sweep.statistics import estimate, interquartile_mean
+from sb3_gae.sweep.statistics import estimate, estimate_each, interquartile_mean
 
 CURVES = [Curve(0.9, None, "no_vf"), *product(["trust_region"], [0.9, 1.0], [0.0, 0.5, 1.0])]
 CELLS = cells_of(["CartPole-v1"], CURVES, range(5), 4, {"vf_steps": 2})
@@ -141,6 +141,13 @@ def test_intervals_are_those_of_a_bootstrap_over_seeds() -> None:
     np.testing.assert_array_equal(np.random.get_state()[1], state)
     single = estimate(values[:1], resamples=10)
     assert single.low == single.iqm == single.high == values[0]
+
+
+def test_estimates_of_several_sizes_keep_their_places() -> None:
+    samples = [np.full(4, 1.0), np.full(2, 2.0), np.full(4, 3.0)]
+    results = estimate_each(samples)
+    assert [float(result.iqm[0]) for result in results] == [1.0, 2.0, 3.0]
+    assert [result.low.shape for result in results] == [(1,)] * 3
 
 
 def test_series_are_in_order_and_bridge_iterations_without_an_episode(table: pd.DataFrame) -> None:

@@ -17,7 +17,7 @@ import rl_zoo3.train
 import torch as th
 
 from sb3_gae import TRPOGAE
-from sb3_gae.sweep import Cell, SweepError, SweepStudy, results_of, run_sweep
+from sb3_gae.sweep import CONDITIONS, Cell, SweepError, SweepStudy, results_of, run_sweep
 from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.ledger import Outcome, Status
 from sb3_gae.sweep.plan import Options
@@ -117,6 +117,12 @@ def test_rows_of_whole_episodes_are_those_of_the_batch() -> None:
     assert [row["mean_return"] for row in rows] == pytest.approx(returns)
     assert experiment.model.num_timesteps - rows[-1]["timesteps"] <= 3, "it ends at the first step of the next batch"
     assert all(np.isfinite(row["explained_variance_after"]) and row["vf_steps"] >= 1 for row in rows)
+
+
+def test_every_condition_runs() -> None:
+    table = run_sweep(seeds=1, **GRID | {"conditions": list(CONDITIONS)}, progress=False)
+    assert set(table["condition"]) == set(CONDITIONS)
+    assert table[table["condition"] == "no_vf"]["gae_lambda"].isna().all()
 
 
 def test_a_failing_cell_is_recorded_and_the_others_go_on() -> None:

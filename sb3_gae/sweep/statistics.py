@@ -1,7 +1,7 @@
 """Interquartile means over seeds, with stratified bootstrap intervals, as rliable recommends and computes them."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -47,6 +47,21 @@ def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
         )
     low, high = intervals[""]
     return Estimate(points[""], low, high)
+
+
+def estimate_each(samples: Sequence[np.ndarray]) -> list[Estimate]:
+    """
+    :param samples: one task's scores at different points, each of shape (runs,); their numbers of runs may differ
+    :return: for each, with arrays of shape (1,)
+    """
+    results: list[Estimate | None] = [None] * len(samples)
+    # One bootstrap for all of a size
+    for size in {len(sample) for sample in samples}:
+        places = [place for place, sample in enumerate(samples) if len(sample) == size]
+        together = estimate(np.stack([samples[place] for place in places], axis=1))
+        for column, place in enumerate(places):
+            results[place] = Estimate(*(part[column : column + 1] for part in together))
+    return [result for result in results if result is not None]
 
 
 @contextlib.contextmanager

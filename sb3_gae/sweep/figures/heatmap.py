@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 from sb3_gae.sweep.figures.style import RED, new_figure, readable_on
 from sb3_gae.sweep.figures.wording import best, rounded, what
 from sb3_gae.sweep.series import Series, at_iteration, series_of, with_lambda
-from sb3_gae.sweep.statistics import estimate
+from sb3_gae.sweep.statistics import estimate_each
 
 
 def heatmap_figure(table: pd.DataFrame, iteration: int | None = None) -> Figure:
@@ -26,7 +26,7 @@ def heatmap_figure(table: pd.DataFrame, iteration: int | None = None) -> Figure:
     """
     series = with_lambda(series_of(table))
     values, iteration = at_iteration(series, iteration)
-    results = [estimate(value[:, None]) for value in values]
+    results = estimate_each(values)
     means = [float(result.iqm[0]) for result in results]
     gammas = sorted({one.curve.gamma for one in series})
     lambdas = sorted({one.curve.gae_lambda or 0.0 for one in series})

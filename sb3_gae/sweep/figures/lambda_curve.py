@@ -12,7 +12,7 @@ from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.figures.style import GREY, RED, RETURN_LABEL, new_figure
 from sb3_gae.sweep.figures.wording import best, seeds, what
 from sb3_gae.sweep.series import Series, at_iteration, series_of, with_lambda
-from sb3_gae.sweep.statistics import Estimate, estimate
+from sb3_gae.sweep.statistics import Estimate, estimate_each
 
 
 def lambda_figure(table: pd.DataFrame, iteration: int | None = None) -> Figure:
@@ -28,7 +28,7 @@ def lambda_figure(table: pd.DataFrame, iteration: int | None = None) -> Figure:
     series = _rising(with_lambda(everything))
     without = [one for one in everything if one.curve.gae_lambda is None]
     values, iteration = at_iteration([*series, *without], iteration)
-    results = [estimate(value[:, None]) for value in values]
+    results = estimate_each(values)
     of_lambda, of_others = results[: len(series)], results[len(series) :]
     first = int(np.argmax([result.iqm[0] for result in of_lambda]))
     top = float(of_lambda[first].iqm[0])
