@@ -1,5 +1,6 @@
 """Runs a grid: here, or in several processes."""
 
+import contextlib
 import multiprocessing
 import queue
 import threading
@@ -81,8 +82,10 @@ def _run_here(plan: Plan, stop: StopRequest, bar: Progress) -> None:
     over = threading.Event()
 
     def show() -> None:
-        while not over.wait(_LOOK_EVERY):
-            bar.show()
+        # What is wrong with the storage is said by the thread that trains
+        with contextlib.suppress(SweepError):
+            while not over.wait(_LOOK_EVERY):
+                bar.show()
 
     # The bar moves while this thread trains
     shower = threading.Thread(target=show, daemon=True)

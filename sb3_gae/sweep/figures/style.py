@@ -23,7 +23,7 @@ STYLE: Any = {
     "svg.hashsalt": "sb3-gae",
 }
 
-RETURN_LABEL = "mean return of an iteration's episodes (sum of rewards)"
+RETURN_LABEL = "mean episode return (sum of rewards)"
 #: of conditions without λ
 GREY = "0.25"
 #: of the best
