@@ -16,7 +16,7 @@ import pytest
 import rl_zoo3.train
 import torch as th
 
-from sb3_gae import TRPOGAE
+from sb3_gae import TRPOGAE, MujocoVecEnv
 from sb3_gae.sweep import CONDITIONS, Cell, SweepError, SweepStudy, results_of, run_sweep
 from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.ledger import Outcome, Status
@@ -101,6 +101,7 @@ def test_rows_of_whole_episodes_are_those_of_the_batch() -> None:
     rows: list[Row] = []
     returns: list[float] = []
 
+    assert isinstance(experiment.model.env, MujocoVecEnv) and experiment.model.env.n_threads == 1
     update = experiment.model.train
 
     def train() -> None:
