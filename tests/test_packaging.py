@@ -89,4 +89,6 @@ def test_files_that_are_no_code_are_installed_too() -> None:
 
 
 def test_extras_exist() -> None:
-    assert {"tests", "docs", "fast", "lab", "ray"} <= set(distribution("sb3-gae").metadata.get_all("Provides-Extra") or [])
+    assert {"tests", "docs", "fast", "lab", "ray", "sweep"} <= set(
+        distribution("sb3-gae").metadata.get_all("Provides-Extra") or []
+    )

@@ -1,0 +1,96 @@
+"""The command line of ``python -m sb3_gae.sweep``: its arguments and what they mean."""
+
+import argparse
+from typing import Any
+
+from rl_zoo3.utils import StoreDict
+
+from sb3_gae.sweep.conditions import CONDITIONS
+from sb3_gae.sweep.figures import KINDS
+from sb3_gae.sweep.presets import PRESETS
+
+_EXAMPLES = """examples:
+  python -m sb3_gae.sweep run --preset small --jobs 2
+  python -m sb3_gae.sweep figure heatmap --preset small
+  python -m sb3_gae.sweep run --env MyEnv-v0 --gammas .96 .99 --lambdas 0 .96 1 --seeds 5 --iterations 50 \\
+      --gym-packages my_module
+
+presets:
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """:return: of the whole command line"""
+    presets = "\n".join(f"  {name:<11} {preset.title}" for name, preset in PRESETS.items())
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_gae.sweep",
+        description="Sweeps of gamma and lambda over tasks, seeds and conditions, and their figures.",
+        epilog=_EXAMPLES + presets,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    _add_run(commands.add_parser("run", help="run the cells of a grid that are not done yet"))
+    status = commands.add_parser("status", help="what is done, running, left, and failed for what reason")
+    _add_study(status)
+    exported = commands.add_parser("export", help="results as CSV and Parquet, a row for each seed and iteration")
+    _add_study(exported)
+    exported.add_argument("-o", "--output", nargs="+", help="files (default: logs/sweeps/NAME.csv and .parquet)")
+    _add_figure(commands.add_parser("figure", help="draw a figure from stored results"))
+    return parser
+
+
+def _add_study(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--preset", metavar="PRESET", help=f"of {', '.join(PRESETS)}")
+    parser.add_argument("--name", help="of the sweep (default: the preset's, or the task's)")
+    parser.add_argument(
+        "--storage", help="URL of a database that Optuna knows, or path of a journal (default: logs/sweeps/NAME.journal)"
+    )
+
+
+def _add_run(parser: argparse.ArgumentParser) -> None:
+    _add_study(parser)
+    parser.add_argument("--env", nargs="+", help="tasks; with a preset, in place of its own")
+    parser.add_argument("--gammas", nargs="+", type=float, help="discount factors")
+    parser.add_argument("--lambdas", nargs="+", type=float, help="weights of longer estimates")
+    parser.add_argument("--conditions", nargs="+", help=f"of {', '.join(CONDITIONS)} (default: trust_region)")
+    parser.add_argument("--seeds", type=int, help="number of seeds")
+    parser.add_argument("--first-seed", type=int, default=0, help="the lowest of them (default: 0)")
+    parser.add_argument("--iterations", type=int, help="batches of each run")
+    parser.add_argument(
+        "-params", "--hyperparams", nargs="+", action=StoreDict, help="other hyperparameters, e.g. target_kl:0.02 vf_steps:3"
+    )
+    parser.add_argument("-conf", "--conf-file", help="settings file as rl-zoo3's (default: the shipped one)")
+    parser.add_argument("--gym-packages", nargs="+", default=[], help="modules that register environments")
+    parser.add_argument("--jobs", type=int, default=1, help="processes side by side (default: 1)")
+    parser.add_argument("--threads", type=int, default=1, help="of PyTorch and physics, in each process (default: 1)")
+    parser.add_argument("--device", default="auto", help="of PyTorch (default: auto)")
+    parser.add_argument("--retry-failed", action="store_true", help="run cells that failed again")
+    parser.add_argument("--dry-run", action="store_true", help="run nothing: what is left, and what it will cost")
+    parser.add_argument("--no-progress", action="store_true", help="no progress bar")
+
+
+def _add_figure(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("kind", choices=KINDS)
+    _add_study(parser)
+    parser.add_argument("--from", dest="source", metavar="FILE", help="an exported file, in place of a storage")
+    parser.add_argument("-o", "--output", help="PNG or SVG file; without an ending both (default: logs/sweeps/NAME_KIND)")
+    parser.add_argument("--iteration", type=int, help="whose returns heatmap and lambda show (default: the last)")
+    parser.add_argument("--env", nargs="+", help="only these tasks")
+    parser.add_argument("--conditions", nargs="+", help="only these")
+    parser.add_argument("--gammas", nargs="+", type=float, help="only these")
+    parser.add_argument("--lambdas", nargs="+", type=float, help="only these")
+    parser.add_argument("--of-iterations", type=int, help="only runs of this length")
+
+
+def selection_of(args: argparse.Namespace) -> dict[str, Any]:
+    """
+    :param args: of the command ``figure``
+    :return: arguments of :func:`~sb3_gae.sweep.results.select`
+    """
+    return {
+        "tasks": args.env,
+        "conditions": args.conditions,
+        "gammas": args.gammas,
+        "lambdas": args.lambdas,
+        "iterations": args.of_iterations,
+    }

@@ -1,0 +1,138 @@
+"""The commands of ``python -m sb3_gae.sweep``."""
+
+import argparse
+import importlib.util
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from sb3_gae.sweep.arguments import make_parser, selection_of
+from sb3_gae.sweep.cost import estimate_cost
+from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.export import export
+from sb3_gae.sweep.figures import draw
+from sb3_gae.sweep.ledger import Status
+from sb3_gae.sweep.plan import Options, Plan, default_name, make_cells
+from sb3_gae.sweep.report import failures, overview, running
+from sb3_gae.sweep.results import NO_PARQUET, read_results, results_of
+from sb3_gae.sweep.runner import check_plan, run_plan, standings_of
+from sb3_gae.sweep.storage import holds
+from sb3_gae.sweep.study import SweepStudy, default_location
+
+#: for the shell
+_FAILED_CELLS, _BAD_INPUT, _STOPPED = 1, 2, 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """
+    :param arguments: of the command line; None for those of this process
+    :return: exit status: 0, or 1 if cells failed, 2 after bad input, 130 if it was stopped
+    """
+    args = make_parser().parse_args(arguments)
+    try:
+        return {"run": _run, "status": _status, "export": _export, "figure": _figure}[args.command](args)
+    except SweepError as error:
+        print(f"sb3_gae.sweep: {error}", file=sys.stderr)
+        return _BAD_INPUT
+    except KeyboardInterrupt:
+        return _STOPPED
+
+
+def _run(args: argparse.Namespace) -> int:
+    plan = _plan_of(args)
+    if args.dry_run:
+        return _dry_run(plan, args.jobs)
+    table = run_plan(plan, args.jobs, retry_failed=args.retry_failed, progress=not args.no_progress)
+    print(overview(plan.name, table))
+    print(failures(table), end="")
+    statuses = {standing.status for standing in table.values()}
+    if Status.FAILED in statuses:
+        return _FAILED_CELLS
+    return _STOPPED if statuses & {Status.WAITING, Status.MISSING} else 0
+
+
+def _plan_of(args: argparse.Namespace) -> Plan:
+    seeds = None if args.seeds is None else range(args.first_seed, args.first_seed + args.seeds)
+    if seeds is None and args.first_seed:
+        raise SweepError("`first-seed` needs --seeds, the number of them.")
+    cells = make_cells(
+        args.preset,
+        env=args.env,
+        gammas=args.gammas,
+        lambdas=args.lambdas,
+        conditions=args.conditions,
+        seeds=seeds,
+        iterations=args.iterations,
+        hyperparams=args.hyperparams,
+    )
+    name = args.name or default_name(args.preset, (cell.task for cell in cells))
+    options = Options(args.conf_file, tuple(args.gym_packages), args.threads, args.device)
+    return Plan(name, args.storage, tuple(cells), options)
+
+
+def _dry_run(plan: Plan, jobs: int) -> int:
+    check_plan(plan)
+    location = plan.location or default_location(plan.name)
+    # Opening what is not there would make it
+    study = SweepStudy(plan.name, location, create=False) if holds(location, plan.name) else None
+    table = standings_of(study, plan)
+    print(overview(plan.name, table))
+    for cost in estimate_cost(plan, table):
+        print(f"{cost.task}: {cost.cells} cells with {cost.iterations} iterations left")
+        print(f"  {_time_range(cost.low / jobs, cost.high / jobs)} in {jobs} job(s), from {cost.basis}")
+    return 0
+
+
+def _time_range(low: float, high: float) -> str:
+    texts = list(dict.fromkeys(_time(seconds) for seconds in (low, high)))
+    return f"about {texts[0]}" if len(texts) == 1 else f"from {texts[0]} to {texts[1]}"
+
+
+def _time(seconds: float) -> str:
+    for size, unit in ((86_400, "days"), (3_600, "h"), (60, "min")):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.2g} s"
+
+
+def _status(args: argparse.Namespace) -> int:
+    study = _study_of(args)
+    table = study.standings()
+    print(overview(study.name, table))
+    print(running(table), end="")
+    print(failures(table), end="")
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    study = _study_of(args)
+    table = results_of(study)
+    outputs = args.output
+    if outputs is None:
+        outputs = [f"logs/sweeps/{study.name}.csv", f"logs/sweeps/{study.name}.parquet"]
+        if importlib.util.find_spec("pyarrow") is None:
+            print(f"no Parquet file: {NO_PARQUET}", file=sys.stderr)
+            outputs.pop()
+    for output in outputs:
+        print(f"wrote {export(table, output)}: {len(table)} rows, {table['trial'].nunique()} cells")
+    return 0
+
+
+def _figure(args: argparse.Namespace) -> int:
+    if args.source is not None:
+        if args.storage is not None or args.name is not None or args.preset is not None:
+            raise SweepError("`from` names a file; leave out --storage, --name and --preset, or --from.")
+        table, name = read_results(args.source), Path(args.source).name.split(".")[0]
+    else:
+        study = _study_of(args)
+        table, name = results_of(study), study.name
+    for path in draw(args.kind, table, args.output or f"logs/sweeps/{name}_{args.kind}", args.iteration, **selection_of(args)):
+        print(f"wrote {path}")
+    return 0
+
+
+def _study_of(args: argparse.Namespace) -> SweepStudy:
+    name = args.name or args.preset
+    if name is None:
+        raise SweepError("Which sweep? Give its --name, or the --preset it was made of.")
+    return SweepStudy(name, args.storage, create=False)

@@ -1,0 +1,5 @@
+"""What the command line prints as one line, without a traceback."""
+
+
+class SweepError(ValueError):
+    """Something that the user can put right: the message says what and how, in one line."""

@@ -1,0 +1,44 @@
+"""Figures into files."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.figures.curves import curves_figure
+from sb3_gae.sweep.figures.heatmap import heatmap_figure
+from sb3_gae.sweep.figures.lambda_curve import lambda_figure
+from sb3_gae.sweep.figures.style import STYLE
+
+FIGURES: dict[str, Callable[..., Figure]] = {"curves": curves_figure, "heatmap": heatmap_figure, "lambda": lambda_figure}
+SUFFIXES = (".png", ".svg")
+
+
+def write_figure(kind: str, table: pd.DataFrame, output: Path, iteration: int | None) -> list[Path]:
+    """
+    :param kind: a key of :data:`FIGURES`
+    :param table: selected by :func:`~sb3_gae.sweep.results.select`
+    :param output: as :func:`~sb3_gae.sweep.figures.draw`
+    :param iteration: as there
+    :return: paths of the files
+    :raises SweepError: if there is nothing to show, or a file cannot be written
+    """
+    paths = [output] if output.suffix in SUFFIXES else [output.with_name(output.name + suffix) for suffix in SUFFIXES]
+    with rc_context(STYLE):
+        figure = FIGURES[kind](table) if kind == "curves" else FIGURES[kind](table, iteration)
+        try:
+            output.parent.mkdir(parents=True, exist_ok=True)
+            for path in paths:
+                _save(figure, path)
+        except OSError as error:
+            raise SweepError(f"`output`: {output} cannot be written ({error}); name another file.") from error
+    return paths
+
+
+def _save(figure: Figure, path: Path) -> None:
+    # Without the date, and without the version of matplotlib
+    metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
+    figure.savefig(path, dpi=160, bbox_inches="tight", metadata=metadata)

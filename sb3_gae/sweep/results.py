@@ -1,0 +1,197 @@
+"""Results as a table: a row for each iteration of each finished cell, from a study or from an exported file."""
+
+import json
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from optuna.trial import FrozenTrial
+
+from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.grid import Cell
+from sb3_gae.sweep.ledger import Status
+from sb3_gae.sweep.provenance import PROVENANCE_COLUMNS
+from sb3_gae.sweep.recorder import COLUMNS as ROW_COLUMNS
+from sb3_gae.sweep.study import FORMAT, SweepStudy
+
+#: what identifies a run
+CELL_COLUMNS = ("task", "condition", "gamma", "gae_lambda", "seed", "iterations", "overrides")
+_TEXT_COLUMNS = ("sweep", "task", "condition", "overrides", *PROVENANCE_COLUMNS, "settings")
+_COUNT_COLUMNS = ("format", "seed", "iterations", "iteration", "timesteps", "episodes", "trial")
+#: of the table and of exported files
+COLUMNS = ("format", "sweep", *CELL_COLUMNS, *ROW_COLUMNS, "setup_seconds", "trial", *PROVENANCE_COLUMNS, "settings")
+
+
+def results_of(study: SweepStudy) -> pd.DataFrame:
+    """
+    :param study: of a sweep
+    :return: finished cells, with the columns of :data:`COLUMNS`, in the order of their trials
+    """
+    done = [standing.trial for standing in study.standings().values() if standing.status == Status.DONE]
+    rows = [row for trial in sorted(filter(None, done), key=lambda trial: trial.number) for row in _rows_of(trial, study.name)]
+    return _typed(pd.DataFrame(rows, columns=list(COLUMNS)))
+
+
+def _rows_of(trial: FrozenTrial, sweep: str) -> Iterator[dict[str, Any]]:
+    stored = trial.user_attrs
+    constants: dict[str, Any] = {
+        "format": FORMAT,
+        "sweep": sweep,
+        **stored["cell"],
+        "setup_seconds": stored.get("setup_seconds"),
+        "trial": trial.number,
+        **{name: stored.get("provenance", {}).get(name, "") for name in PROVENANCE_COLUMNS},
+        "settings": json.dumps(stored.get("settings", {}), sort_keys=True),
+    }
+    for name in sorted(name for name in stored if name.startswith("rows:")):
+        chunk = stored[name]
+        for values in zip(*chunk.values(), strict=True):
+            yield constants | dict(zip(chunk, values, strict=True))
+
+
+def read_results(path: str | Path) -> pd.DataFrame:
+    """
+    :param path: of an exported ``.csv`` (perhaps compressed) or ``.parquet`` file
+    :return: its table, with the columns of :data:`COLUMNS`
+    :raises SweepError: if there is no such file, it is something else, or another version wrote it
+    """
+    path = Path(path)
+    try:
+        table = read_parquet(path) if is_parquet(path) else _read_csv(path)
+    except FileNotFoundError:
+        raise SweepError(f"There is no results file {path}; make it with: python -m sb3_gae.sweep export") from None
+    except (OSError, ValueError, pd.errors.ParserError) as error:
+        if isinstance(error, SweepError):
+            raise
+        raise SweepError(f"{path} cannot be read as a results file ({' '.join(str(error).split())[:200]}).") from error
+    if "format" not in table or "sweep" not in table:
+        raise SweepError(f"{path} is not a results file of a sweep; make one with: python -m sb3_gae.sweep export")
+    versions = sorted(set(table["format"]))
+    if versions != [FORMAT] and versions:
+        written = ", ".join(map(str, versions))
+        raise SweepError(f"{path} is of format {written}, and this sb3-gae knows {FORMAT}; export it anew from its storage.")
+    if missing := [name for name in COLUMNS if name not in table]:
+        raise SweepError(f"{path} lacks the columns {', '.join(missing)}; export it anew from its storage.")
+    return _typed(table)
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
+    # Texts as they are: a commit may look like a number
+    return pd.read_csv(path, dtype=dict.fromkeys(_TEXT_COLUMNS, str), float_precision="round_trip")
+
+
+def is_parquet(path: Path) -> bool:
+    """
+    :param path: of an exported file
+    :return: whether it is Parquet, else CSV
+    """
+    return path.suffix == ".parquet"
+
+
+def read_parquet(path: Path) -> pd.DataFrame:
+    """
+    :param path: of the file
+    :return: its table
+    :raises SweepError: if no library for it is installed
+    """
+    try:
+        return pd.read_parquet(path)
+    except ImportError:
+        raise SweepError(NO_PARQUET) from None
+
+
+NO_PARQUET = 'Parquet needs pyarrow: pip install "sb3-gae[sweep]", or use a .csv file.'
+
+
+def _typed(table: pd.DataFrame) -> pd.DataFrame:
+    """The same types, whether from a study, CSV or Parquet."""
+    types: dict[str, Any] = dict.fromkeys(COLUMNS, float)
+    types |= dict.fromkeys(_COUNT_COLUMNS, "int64") | dict.fromkeys(_TEXT_COLUMNS, object)
+    table = table[list(COLUMNS)]
+    return table.fillna(dict.fromkeys(_TEXT_COLUMNS, "")).astype(types)
+
+
+def select(
+    table: pd.DataFrame,
+    *,
+    tasks: Iterable[str] | None = None,
+    conditions: Iterable[str] | None = None,
+    gammas: Iterable[float] | None = None,
+    lambdas: Iterable[float] | None = None,
+    iterations: int | None = None,
+) -> pd.DataFrame:
+    """
+    :param table: of results
+    :param tasks: to keep; None for all, as below
+    :param conditions: to keep
+    :param gammas: to keep
+    :param lambdas: to keep, beside cells of conditions without λ
+    :param iterations: of the cells to keep
+    :return: one task's rows, with runs of one length and one set of overrides
+    :raises SweepError: if nothing is left, or several kinds are left that do not go together
+    """
+    if table.empty:
+        raise SweepError("No cell has finished yet; see: python -m sb3_gae.sweep status")
+    wanted = {
+        "task": tasks,
+        "condition": conditions,
+        "gamma": gammas,
+        "gae_lambda": lambdas,
+        "iterations": None if iterations is None else [iterations],
+    }
+    for column, values in wanted.items():
+        if values is None:
+            continue
+        kept = table[column].isin(list(values))
+        if column == "gae_lambda":
+            kept |= table[column].isna()
+        if not kept.any():
+            held = ", ".join(_shown(value) for value in sorted(table[column].dropna().unique()))
+            raise SweepError(f"The selection is empty: no finished cell has {column} {_listed(values)}; there are {held}.")
+        table = table[kept]
+    for column, option in {
+        "task": "--env",
+        "iterations": "--of-iterations",
+        "overrides": "--from a file of one of them",
+    }.items():
+        found = sorted(table[column].unique())
+        if len(found) > 1:
+            shown = ", ".join(map(_shown, found))
+            raise SweepError(f"The selection mixes runs whose {column} differ ({shown}); choose one with {option}.")
+    return table
+
+
+def _listed(values: Iterable[Any]) -> str:
+    return ", ".join(map(_shown, values))
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def identities(table: pd.DataFrame) -> set[tuple[Any, ...]]:
+    """
+    :param table: of results
+    :return: what tells its rows apart
+    """
+    columns: Sequence[str] = (*CELL_COLUMNS, "iteration")
+    return set(table[list(columns)].fillna({"gae_lambda": -1.0}).itertuples(index=False, name=None))
+
+
+def rows_of_cells(table: pd.DataFrame, cells: Iterable[Cell]) -> pd.DataFrame:
+    """
+    :param table: of results
+    :param cells: of a grid
+    :return: the rows of these cells
+    """
+    trials = table.drop_duplicates("trial")
+    keys = {cell.key for cell in cells}
+    own = [trial.trial for trial in trials.itertuples() if _cell_of(trial).key in keys]
+    return table[table["trial"].isin(own)].reset_index(drop=True)
+
+
+def _cell_of(row: Any) -> Cell:
+    gae_lambda = None if math.isnan(row.gae_lambda) else row.gae_lambda
+    return Cell(row.task, row.condition, row.gamma, gae_lambda, row.seed, row.iterations, row.overrides)

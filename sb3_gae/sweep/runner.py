@@ -1,0 +1,157 @@
+"""Runs a grid: here, or in several processes."""
+
+import contextlib
+import multiprocessing
+import queue
+import threading
+import time
+from typing import Any
+
+from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.ledger import Standing, Status
+from sb3_gae.sweep.plan import Plan
+from sb3_gae.sweep.progress import Progress
+from sb3_gae.sweep.settings import check_overrides, check_tasks, import_packages, shipped_settings
+from sb3_gae.sweep.study import SweepStudy
+from sb3_gae.sweep.worker import StopRequest, work, work_as_process
+
+#: seconds between looks at the storage for the progress bar
+_LOOK_EVERY = 2.0
+#: seconds for processes that were asked to stop
+_PATIENCE = 60.0
+
+
+def check_plan(plan: Plan) -> dict[str, dict[str, Any]]:
+    """
+    :param plan: what a command asks for
+    :return: the settings of each task, without overrides
+    :raises SweepError: if something in it cannot be run
+    """
+    import_packages(plan.options.gym_packages)
+    tasks = list(dict.fromkeys(cell.task for cell in plan.cells))
+    check_tasks(tasks)
+    check_overrides(plan.cells)
+    return {task: shipped_settings(task, plan.options.conf_file) for task in tasks}
+
+
+def run_plan(plan: Plan, jobs: int = 1, *, retry_failed: bool = False, progress: bool = True) -> dict[str, Standing]:
+    """
+    Run what is not done, until nothing is left that this machine could run.
+
+    :param plan: what to run
+    :param jobs: processes; with 1 the cells run in this one
+    :param retry_failed: whether cells that failed are run again
+    :param progress: whether to show a bar
+    :return: where each cell of the plan stands, by its key
+    :raises SweepError: if something in the plan cannot be run, or the storage cannot be used
+    """
+    if jobs < 1:
+        raise SweepError(f"`jobs` must be at least 1, got {jobs}.")
+    settings = check_plan(plan)
+    study = SweepStudy(plan.name, plan.location, silent_after=plan.silent_after)
+    study.check_settings(settings)
+    study.take_back()
+    study.enqueue(plan.cells, retry_failed=retry_failed)
+    stop = StopRequest()
+    # Only the main thread may
+    handlers = stop.listen() if threading.current_thread() is threading.main_thread() else {}
+    try:
+        with Progress(study, plan.cells, show=progress) as bar:
+            if jobs == 1:
+                _run_here(plan, stop, bar)
+            else:
+                _Pool(plan, jobs).run(stop, bar)
+    finally:
+        stop.restore(handlers)
+    if stop.reason and progress:
+        print(f"{stop.reason}: unfinished cells begin anew when the command is run again")
+    return standings_of(study, plan)
+
+
+def standings_of(study: SweepStudy | None, plan: Plan) -> dict[str, Standing]:
+    """
+    :param study: of the sweep; None if it has not begun
+    :param plan: whose cells matter
+    :return: where each cell of the plan stands, by its key
+    """
+    table = {} if study is None else study.standings()
+    return {cell.key: table.get(cell.key, Standing(Status.MISSING, None, 0)) for cell in plan.cells}
+
+
+def _run_here(plan: Plan, stop: StopRequest, bar: Progress) -> None:
+    over = threading.Event()
+
+    def show() -> None:
+        # What is wrong with the storage is said by the thread that trains
+        with contextlib.suppress(SweepError):
+            while not over.wait(_LOOK_EVERY):
+                bar.show()
+
+    # The bar moves while this thread trains
+    shower = threading.Thread(target=show, daemon=True)
+    shower.start()
+    try:
+        work(plan, stop)
+    finally:
+        over.set()
+        shower.join()
+
+
+class _Pool:
+    """
+    Processes that each run one cell after another.
+
+    :param plan: what to run
+    :param jobs: number of processes
+    """
+
+    def __init__(self, plan: Plan, jobs: int):
+        self._plan = plan
+        # Spawned: a forked process would inherit locks and threads of PyTorch
+        self._context = multiprocessing.get_context("spawn")
+        self._messages = self._context.Queue()
+        self._workers = [self._start() for _ in range(min(jobs, len(plan.cells)))]
+
+    def _start(self) -> Any:
+        process = self._context.Process(target=work_as_process, args=(self._plan, self._messages), daemon=True)
+        process.start()
+        return process
+
+    def run(self, stop: StopRequest, bar: Progress) -> None:
+        try:
+            while self._workers and not stop.is_set():
+                time.sleep(0.2)
+                self._workers = [again for worker in self._workers if (again := self._look_after(worker)) is not None]
+                bar.show_now_and_then(_LOOK_EVERY)
+        finally:
+            self._end()
+
+    def _look_after(self, worker: Any) -> Any:
+        """:return: the process itself, its successor if it was killed, None if it had nothing left to do"""
+        if worker.is_alive():
+            return worker
+        worker.join()
+        if worker.exitcode == 0:
+            return None
+        if worker.exitcode < 0:
+            # Its cell is given up and asked for again, but not for ever, when the next one claims
+            return self._start()
+        raise SweepError(self._message() or "A process of the sweep ended with an error, which is printed above.")
+
+    def _message(self) -> str:
+        try:
+            return self._messages.get(timeout=1.0)
+        except queue.Empty:
+            return ""
+
+    def _end(self) -> None:
+        """Ask all that are left to stop, and wait until they have stored how far they were."""
+        for worker in self._workers:
+            if worker.is_alive():
+                worker.terminate()
+        until = time.monotonic() + _PATIENCE
+        for worker in self._workers:
+            worker.join(max(0.0, until - time.monotonic()))
+            if worker.is_alive():
+                worker.kill()
+                worker.join()

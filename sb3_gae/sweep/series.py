@@ -1,0 +1,75 @@
+"""Arrays for figures, out of a table of results."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sb3_gae.sweep.conditions import CONDITIONS
+from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.grid import Curve
+
+
+class Series(NamedTuple):
+    """
+    :param curve: what the runs have in common
+    :param returns: mean return of the episodes of each iteration, shape (seeds, iterations)
+    """
+
+    curve: Curve
+    returns: np.ndarray
+
+    @property
+    def n_seeds(self) -> int:
+        """Number of runs."""
+        return len(self.returns)
+
+
+def series_of(table: pd.DataFrame) -> list[Series]:
+    """
+    :param table: results of one task, with runs of one length
+    :return: one for each curve: in the order of conditions, γ rising, λ falling
+    """
+    found = []
+    for (condition, gamma, gae_lambda), rows in table.groupby(["condition", "gamma", "gae_lambda"], dropna=False):
+        wide = rows.pivot(index="seed", columns="iteration", values="mean_return")
+        # In some batches no episode ends; the last known return stands for them
+        returns = wide.ffill(axis="columns").to_numpy()
+        found.append(Series(Curve(gamma, None if math.isnan(gae_lambda) else gae_lambda, condition), returns))
+    names = list(CONDITIONS)
+    without_vf_first = {name: (CONDITIONS[name].uses_lambda, names.index(name)) for name in names}
+    return sorted(
+        found, key=lambda one: (without_vf_first[one.curve.condition], one.curve.gamma, -(one.curve.gae_lambda or 0.0))
+    )
+
+
+def at_iteration(series: list[Series], iteration: int | None) -> tuple[list[np.ndarray], int]:
+    """
+    :param series: of runs of one length
+    :param iteration: from 1; None for the last
+    :return: returns there, each of shape (seeds,), and the iteration
+    :raises SweepError: if the runs are shorter, or no episode had ended by then
+    """
+    n_iterations = series[0].returns.shape[1]
+    iteration = n_iterations if iteration is None else iteration
+    if not 1 <= iteration <= n_iterations:
+        raise SweepError(f"`iteration` must be from 1 to {n_iterations}, the length of the runs, got {iteration}.")
+    values = [one.returns[:, iteration - 1] for one in series]
+    if any(np.isnan(value).any() for value in values):
+        raise SweepError(f"`iteration`: in some runs no episode had ended by iteration {iteration}; choose a later one.")
+    return values, iteration
+
+
+def with_lambda(series: list[Series]) -> list[Series]:
+    """
+    :param series: of a figure that shows one condition
+    :return: those that have a λ
+    :raises SweepError: if they are of several conditions, or there is none
+    """
+    found = [one for one in series if one.curve.gae_lambda is not None]
+    conditions = sorted({one.curve.condition for one in found})
+    if len(conditions) != 1:
+        held = f"the selection has {', '.join(conditions)}; choose with --conditions" if found else "the selection has none"
+        raise SweepError(f"This figure shows one condition that has a λ, and {held}.")
+    return found

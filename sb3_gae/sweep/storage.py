@@ -1,0 +1,159 @@
+"""Optuna's storages: opened by path or URL, safe for many processes, and with errors of one line."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import optuna
+import sqlalchemy
+from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
+from sqlalchemy.exc import SQLAlchemyError
+
+from sb3_gae.sweep.errors import SweepError
+
+#: seconds that a process waits for another one's write
+_LOCK_SECONDS = 60
+
+
+class _TidyLock(JournalFileSymlinkLock):
+    """
+    Optuna's lock, whose holder finds a journal of whole lines.
+
+    A process that is killed, or a disk that fills up, in the middle of a line leaves a torn one. Optuna would append to
+    it and could not read the file any more. Here it is taken away first: whoever began it was not told that it is stored.
+
+    :param path: of the journal
+    """
+
+    def __init__(self, path: Path):
+        super().__init__(str(path))
+        self._path = path
+
+    def acquire(self) -> bool:
+        acquired = super().acquire()
+        try:
+            _remove_torn_line(self._path)
+        except BaseException:
+            self.release()
+            raise
+        return acquired
+
+
+def _remove_torn_line(path: Path) -> None:
+    with path.open("rb+") as file:
+        size = file.seek(0, 2)
+        if size == 0:
+            return
+        file.seek(size - 1)
+        if file.read(1) == b"\n":
+            return
+        start = max(0, size - 2**20)
+        while True:
+            file.seek(start)
+            found = file.read(size - start).rfind(b"\n")
+            if found >= 0 or start == 0:
+                file.truncate(start + found + 1)
+                return
+            start = max(0, start - 2**20)
+
+
+def open_storage(location: str, *, create: bool) -> optuna.storages.BaseStorage:
+    """
+    :param location: URL of a database that Optuna knows, or path of a journal file
+    :param create: whether to make what is not there
+    :return: the storage
+    :raises SweepError: if it cannot be reached, is locked, or is something else
+    """
+    with storage_errors(location):
+        if "://" in location:
+            return _open_database(location)
+        # Absolute: the lock is a symbolic link to the file, and a dangling one is never seen to grow old
+        path = Path(location).absolute()
+        if not create and not path.exists():
+            raise SweepError(f"There is no sweep at {location}; run one first, or name its --storage.")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return optuna.storages.JournalStorage(JournalFileBackend(str(path), lock_obj=_TidyLock(path)))
+
+
+def _open_database(url: str) -> optuna.storages.BaseStorage:
+    is_sqlite = sqlalchemy.make_url(url).get_backend_name() == "sqlite"
+    storage = optuna.storages.RDBStorage(url, engine_kwargs={"connect_args": {"timeout": _LOCK_SECONDS}} if is_sqlite else {})
+    if is_sqlite:
+        _begin_with_a_lock(storage.engine)
+    return storage
+
+
+def _begin_with_a_lock(engine: sqlalchemy.Engine) -> None:
+    """
+    Let SQLite lock when a transaction begins and not when it first writes.
+
+    Otherwise two processes may both read that a cell waits and then both take it: SQLite has no rows to lock.
+    """
+
+    @sqlalchemy.event.listens_for(engine, "connect")
+    def leave_transactions_to_us(connection: Any, _: Any) -> None:
+        connection.isolation_level = None
+
+    @sqlalchemy.event.listens_for(engine, "begin")
+    def begin(connection: sqlalchemy.Connection) -> None:
+        connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+    # Connections that were made before
+    engine.dispose()
+
+
+@contextlib.contextmanager
+def storage_errors(location: str) -> Iterator[None]:
+    """
+    Say in one line what is wrong with a storage.
+
+    :param location: its URL or path, for the message
+    :raises SweepError: in place of what Optuna, SQLAlchemy or the file system raise
+    """
+    try:
+        yield
+    except (SweepError, optuna.exceptions.UpdateFinishedTrialError):
+        raise
+    except (OSError, SQLAlchemyError, ImportError, optuna.exceptions.OptunaError) as error:
+        raise SweepError(_explain(location, error)) from error
+    except (ValueError, KeyError, TypeError, AssertionError) as error:
+        # What reading a journal that is none ends in
+        raise SweepError(_explain(location, error)) from error
+
+
+def _explain(location: str, error: Exception) -> str:
+    where, what = without_password(location), " ".join(str(error).split()) or type(error).__name__
+    if "locked" in what:
+        return f"The storage {where} is locked by another program; wait for it, or pass another --storage. ({what[:200]})"
+    if isinstance(error, ImportError):
+        return f"The storage {where} needs a driver that is not installed: {what[:200]}"
+    if isinstance(error, OSError | SQLAlchemyError):
+        return f"The storage {where} cannot be reached: {what[:200]}. Check the path or the URL, and that it can be written."
+    return f"The storage {where} is not one of Optuna's, or it is damaged ({what[:200]}); pass another --storage."
+
+
+def without_password(location: str) -> str:
+    """
+    :param location: URL or path of a storage
+    :return: the same, fit to be shown
+    """
+    try:
+        return sqlalchemy.make_url(location).render_as_string(hide_password=True) if "://" in location else location
+    except SQLAlchemyError:
+        return location.split("://", 1)[0] + "://..."
+
+
+def holds(location: str, study: str) -> bool:
+    """
+    Look without making anything.
+
+    :param location: URL or path of a storage
+    :param study: name
+    :return: whether the storage is there and has the study
+    :raises SweepError: if it cannot be reached
+    """
+    if "://" not in location and not Path(location).exists():
+        return False
+    with storage_errors(location):
+        return study in optuna.get_all_study_names(open_storage(location, create=False))

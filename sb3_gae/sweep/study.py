@@ -1,0 +1,283 @@
+"""A sweep as an Optuna study: cells are trials, shared by every process that opens the same storage."""
+
+import contextlib
+import time
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import optuna
+from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.trial import FrozenTrial, TrialState
+
+from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.grid import Cell
+from sb3_gae.sweep.ledger import Outcome, Standing, Status, duplicates, standings
+from sb3_gae.sweep.liveness import SILENT_AFTER, sign_of_life, why_dead
+from sb3_gae.sweep.storage import open_storage, storage_errors, without_password
+
+#: of what is stored; another one is refused
+FORMAT = 1
+_FORMAT_ATTRIBUTE = "sb3_gae_sweep_format"
+
+_DISTRIBUTIONS: dict[str, BaseDistribution] = {
+    "gamma": FloatDistribution(0.0, 1.0),
+    "gae_lambda": FloatDistribution(0.0, 1.0),
+    "seed": IntDistribution(0, 2**32 - 1),
+}
+
+
+class TakenOverError(RuntimeError):
+    """Another process has taken the cell over, or finished it; what is computed here is not wanted any more."""
+
+
+class SweepStudy:
+    """
+    :param name: of the sweep
+    :param location: path or URL of the storage; None for ``logs/sweeps/<name>.journal``
+    :param create: whether to begin a sweep that is not there
+    :param silent_after: seconds without a sign of life after which another machine's cell is taken over
+    :raises SweepError: if the storage cannot be used, or holds something else
+    """
+
+    def __init__(self, name: str, location: str | None = None, *, create: bool = True, silent_after: float = SILENT_AFTER):
+        self.name = name
+        self.location = location or default_location(name)
+        self.silent_after = silent_after
+        # Optuna announces studies, and warns of what is only experimental
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self.storage = open_storage(self.location, create=create)
+        with self.errors():
+            self._study = self._open(create)
+            self._study_id = self.storage.get_study_id_from_name(name)
+
+    def errors(self) -> contextlib.AbstractContextManager[None]:
+        """:return: a context in which errors of the storage are said in one line"""
+        return storage_errors(self.location)
+
+    def _open(self, create: bool) -> optuna.Study:
+        names = optuna.get_all_study_names(self.storage)
+        if self.name not in names:
+            if not create:
+                held = f"it holds {', '.join(sorted(names))}" if names else "it is empty"
+                raise SweepError(f"There is no sweep {self.name!r} in {without_password(self.location)}: {held}.")
+            study = optuna.create_study(study_name=self.name, storage=self.storage, direction="maximize", load_if_exists=True)
+            # Whoever comes second writes the same
+            study.set_user_attr(_FORMAT_ATTRIBUTE, FORMAT)
+            return study
+        study = optuna.load_study(study_name=self.name, storage=self.storage)
+        self._check_format(study)
+        return study
+
+    def _check_format(self, study: optuna.Study) -> None:
+        found = study.user_attrs.get(_FORMAT_ATTRIBUTE)
+        if found is None and not study.get_trials(deepcopy=False):
+            study.set_user_attr(_FORMAT_ATTRIBUTE, FORMAT)  # begun by a process that did not get this far
+        elif found != FORMAT:
+            what = "is no sweep of sb3-gae" if found is None else f"is of format {found}, and this sb3-gae knows {FORMAT}"
+            advice = "choose another --name" if found is None else "use the sb3-gae that wrote it, or another --name"
+            raise SweepError(f"The study {self.name!r} in {without_password(self.location)} {what}; {advice}.")
+
+    def trials(self) -> list[FrozenTrial]:
+        """:return: all of the study, not to be changed"""
+        with self.errors():
+            return self._study.get_trials(deepcopy=False)
+
+    def standings(self) -> dict[str, Standing]:
+        """:return: where each cell stands, by its key"""
+        return standings(self.trials())
+
+    def check_settings(self, settings: Mapping[str, Mapping[str, Any]]) -> None:
+        """
+        Refuse to mix runs of different settings; remember those of tasks that are new.
+
+        :param settings: of each task, as the settings file has them
+        :raises SweepError: if they are not those that the sweep began with
+        """
+        with self.errors():
+            for task, now in settings.items():
+                before = self._study.user_attrs.get(f"settings:{task}")
+                if before is None:
+                    self._study.set_user_attr(f"settings:{task}", dict(now))
+                    continue
+                changed = [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
+                if changed:
+                    what = ", ".join(f"{name} {before.get(name)!r} -> {now.get(name)!r}" for name in changed)
+                    raise SweepError(
+                        f"The settings of {task} have changed since the sweep {self.name!r} began ({what}); "
+                        "choose another --name, or go back to them with --conf-file."
+                    )
+
+    def enqueue(self, cells: Iterable[Cell], *, retry_failed: bool = False) -> None:
+        """
+        Ask for cells that are neither done nor asked for.
+
+        :param cells: of the grid
+        :param retry_failed: ask again for those that failed
+        """
+        table = self.standings()
+        with self.errors():
+            for cell in cells:
+                standing = table.get(cell.key)
+                again = standing is not None and (
+                    standing.status == Status.MISSING or (retry_failed and standing.status == Status.FAILED)
+                )
+                if standing is None or again:
+                    self.storage.create_new_trial(
+                        self._study_id, _template(cell, 0 if standing is None else standing.attempt + 1)
+                    )
+            for trial in duplicates(self.trials()):
+                self._end(trial, Outcome.DUPLICATE, "another trial of the same cell counts")
+
+    def claim(self, cells: Iterable[Cell]) -> "Claim | None":
+        """
+        Take a cell that waits, which nobody else can take then; first see to those whose process is gone.
+
+        :param cells: to choose from, in this order
+        :return: the first that could be had, None if there is none
+        """
+        cells = list(cells)
+        if self.take_back():
+            self.enqueue(cells)
+        table = self.standings()
+        with self.errors():
+            for cell in cells:
+                standing = table.get(cell.key)
+                if standing is None or standing.status != Status.WAITING or standing.trial is None:
+                    continue
+                try:
+                    if self.storage.set_trial_state_values(self._id_of(standing.trial), TrialState.RUNNING):
+                        return Claim(self, cell, self._id_of(standing.trial))
+                except UpdateFinishedTrialError:
+                    continue
+        return None
+
+    def take_back(self) -> list[Standing]:
+        """
+        Give up running trials whose process is gone, so that their cells can be asked for again.
+
+        :return: their standings before
+        """
+        lost = []
+        for standing in self.standings().values():
+            if standing.status == Status.RUNNING and standing.trial is not None:
+                reason = why_dead(_last_sign(standing.trial), time.time(), self.silent_after)
+                if reason and self._end(standing.trial, Outcome.LOST, reason):
+                    lost.append(standing)
+        return lost
+
+    def _end(self, trial: FrozenTrial, outcome: Outcome, reason: str) -> bool:
+        """:return: whether it had not ended before"""
+        trial_id = self._id_of(trial)
+        try:
+            with self.errors():
+                self.storage.set_trial_user_attr(trial_id, "outcome", outcome)
+                self.storage.set_trial_user_attr(trial_id, "reason", reason)
+                return self.storage.set_trial_state_values(trial_id, TrialState.FAIL)
+        except UpdateFinishedTrialError:
+            return False
+
+    def _id_of(self, trial: FrozenTrial) -> int:
+        return self.storage.get_trial_id_from_study_id_trial_number(self._study_id, trial.number)
+
+
+class Claim:
+    """
+    A cell that this process runs. Every method raises :class:`TakenOverError` if it has lost the cell.
+
+    :param sweep: the cell is of
+    :param cell: to be run
+    :param trial_id: of the storage
+    """
+
+    def __init__(self, sweep: SweepStudy, cell: Cell, trial_id: int):
+        self.cell = cell
+        self._sweep, self._trial_id, self._n_chunks = sweep, trial_id, 0
+        self.beat()
+
+    def beat(self) -> None:
+        """Give a sign of life."""
+        self._set("sign_of_life", sign_of_life())
+
+    def describe(self, **what: Any) -> None:
+        """:param what: to be stored with the cell, as JSON"""
+        for name, value in what.items():
+            self._set(name, value)
+
+    def append(self, rows: Sequence[Mapping[str, float]]) -> None:
+        """
+        Store a piece of the learning curve.
+
+        :param rows: one for each iteration, with the columns of :data:`~sb3_gae.sweep.recorder.COLUMNS`
+        """
+        if not rows:
+            return
+        self._set(f"rows:{self._n_chunks:05d}", {name: [row[name] for row in rows] for name in rows[0]})
+        self._n_chunks += 1
+        for row in rows:
+            with self._own():
+                self._sweep.storage.set_trial_intermediate_value(self._trial_id, int(row["iteration"]), row["mean_return"])
+        self.beat()
+
+    def complete(self, value: float) -> None:
+        """:param value: mean return of the last iteration that has one"""
+        with self._own():
+            self._sweep.storage.set_trial_state_values(self._trial_id, TrialState.COMPLETE, [value])
+
+    def give_up(self, outcome: Outcome, reason: str) -> None:
+        """
+        :param outcome: why it did not complete
+        :param reason: the same in words
+        """
+        self.describe(outcome=outcome, reason=reason)
+        with self._own():
+            self._sweep.storage.set_trial_state_values(self._trial_id, TrialState.FAIL)
+
+    def _set(self, name: str, value: Any) -> None:
+        with self._own():
+            self._sweep.storage.set_trial_user_attr(self._trial_id, name, value)
+
+    @contextlib.contextmanager
+    def _own(self) -> Iterator[None]:
+        """A context in which a trial that has ended means that the cell is lost."""
+        try:
+            with self._sweep.errors():
+                yield
+        except UpdateFinishedTrialError as error:
+            raise TakenOverError(str(error)) from error
+
+
+def default_location(name: str) -> str:
+    """
+    :param name: of a sweep
+    :return: where it is stored unless the user says otherwise
+    :raises SweepError: if it is no name for a file
+    """
+    if not name or name in (".", "..") or any(character in name for character in "/\\:\0"):
+        raise SweepError(f"`name` must be a name without slashes and colons, got {name!r}.")
+    return f"logs/sweeps/{name}.journal"
+
+
+def _template(cell: Cell, attempt: int) -> FrozenTrial:
+    params = {"gamma": cell.gamma, "seed": cell.seed}
+    if cell.gae_lambda is not None:
+        params["gae_lambda"] = cell.gae_lambda
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        return optuna.trial.create_trial(
+            state=TrialState.WAITING,
+            params=params,
+            distributions={name: _DISTRIBUTIONS[name] for name in params},
+            user_attrs={"cell": asdict(cell), "attempt": attempt},
+        )
+
+
+def _last_sign(trial: FrozenTrial) -> Mapping[str, Any]:
+    sign = trial.user_attrs.get("sign_of_life")
+    if sign is not None:
+        return sign
+    # Taken, and gone before it could say by whom
+    taken = trial.datetime_start.timestamp() if trial.datetime_start is not None else 0.0
+    return {"host": "(unknown)", "pid": "(unknown)", "time": taken}

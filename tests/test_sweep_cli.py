@@ -1,0 +1,79 @@
+"""``python -m sb3_gae.sweep``."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from sb3_gae.sweep.cli import main
+
+RUN = ["run", "--env", "CartPole-v1", "--lambdas", "0", "1", "--iterations", "2", "--no-progress"]
+TINY = ["-params", "n_envs:1", "n_steps:32", "policy_kwargs:dict(net_arch=[4])"]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_from_a_dry_run_to_figures(capsys: pytest.CaptureFixture[str]) -> None:
+    grid = [*RUN, "--gammas", ".9", "--seeds", "2", "--name", "s", *TINY]
+    assert main([*grid, "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "4 cells, 0 done, 4 left" in said
+    assert re.search(r"CartPole-v1: 4 cells with 8 iterations left\n  about [\d.]+ s in 1 job\(s\), from an iteration", said)
+    assert not list(Path().iterdir()), "a dry run makes no files"
+
+    assert main(grid) == 0
+    assert "4 cells, 4 done, 0 left" in capsys.readouterr().out
+    assert main(["status", "--name", "s"]) == 0
+    assert "2/2 CartPole-v1, trust_region, γ = 0.9, λ = 1, 2 iterations" in capsys.readouterr().out
+    assert main([*grid, "--seeds", "3", "--dry-run"]) == 0
+    assert "from 4 cells that are done" in capsys.readouterr().out
+
+    assert main(["export", "--name", "s", "-o", "results.csv"]) == 0
+    assert main(["figure", "lambda", "--from", "results.csv"]) == 0
+    assert main(["figure", "curves", "--name", "s", "-o", "figures/curves.svg"]) == 0
+    assert Path("logs/sweeps/results_lambda.png").exists() and Path("figures/curves.svg").exists()
+
+
+def test_cells_that_fail_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    grid = [*RUN, "--gammas", ".9", "--seeds", "1", "-params", "n_envs:1", "n_steps:1"]
+    assert main(grid) == 1
+    said = capsys.readouterr().out
+    assert "failed: CartPole-v1, trust_region, γ = 0.9, λ = 0, seed 0, 2 iterations: ValueError: A batch needs" in said
+    assert "--retry-failed" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([*RUN, "--gammas", "1.5", "--seeds", "1"], "`gamma` must be a number in [0, 1], got 1.5"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "--env", "CartPol-v1"], "did you mean 'CartPole-v1'?"),
+        ([*RUN, "--gammas", "1"], "`seeds` is missing"),
+        ([*RUN, "--gammas", "1", "--first-seed", "4"], "`first-seed` needs --seeds"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "--storage", "file/x.journal"], "cannot be reached"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "--conditions", "none"], "`conditions` knows"),
+        (["run", "--preset", "fig2"], "`preset` knows"),
+        (["status"], "Which sweep?"),
+        (["status", "--preset", "small"], "There is no sweep at logs/sweeps/small.journal"),
+        (["figure", "curves", "--from", "nothing.csv"], "There is no results file nothing.csv"),
+        (["figure", "curves", "--from", "nothing.csv", "--name", "s"], "leave out --storage, --name and --preset"),
+    ],
+)
+def test_errors_are_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("file").touch()
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert message in said and said.startswith("sb3_gae.sweep: ") and said.count("\n") == 1
+    assert [path.name for path in Path().iterdir()] == ["file"]
+
+
+def test_help_names_presets_and_conditions(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(["--help"])
+    assert "fig2-left" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="0"):
+        main(["run", "--help"])
+    assert "no_vf" in capsys.readouterr().out

@@ -1,0 +1,238 @@
+"""Results of a sweep: export, statistics, selections and figures."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from rliable import metrics
+
+from sb3_gae.sweep import Cell, Curve, SweepError, SweepStudy, draw, export, read_results, results_of, select
+from sb3_gae.sweep.export import SUFFIXES
+from sb3_gae.sweep.figures.curves import curves_figure
+from sb3_gae.sweep.figures.heatmap import heatmap_figure
+from sb3_gae.sweep.figures.lambda_curve import lambda_figure
+from sb3_gae.sweep.grid import cells_of, product
+from sb3_gae.sweep.provenance import provenance
+from sb3_gae.sweep.recorder import COLUMNS
+from sb3_gae.sweep.results import rows_of_cells
+from sb3_gae.sweep.series import series_of
+from sb3_gae.sweep.statistics import estimate, estimate_each, interquartile_mean
+
+CURVES = [Curve(0.9, None, "no_vf"), *product(["trust_region"], [0.9, 1.0], [0.0, 0.5, 1.0])]
+CELLS = cells_of(["CartPole-v1"], CURVES, range(5), 4, {"vf_steps": 2})
+
+
+def mean_return(cell: Cell, iteration: int) -> float:
+    """Best at γ = 1, λ = 0.5."""
+    of_lambda = 0.8 if cell.gae_lambda is None else (cell.gae_lambda - 0.5) ** 2
+    return 100.0 + iteration * (10.0 * cell.gamma - of_lambda) + np.sin(cell.seed + iteration)
+
+
+def fill(study: SweepStudy, cells: list[Cell]) -> None:
+    """As if they had been run: the curve in two pieces, the middle of it without an episode that ended."""
+    study.enqueue(cells)
+    while (claim := study.claim(cells)) is not None:
+        rows = [dict.fromkeys(COLUMNS, float("nan")) for _ in range(claim.cell.iterations)]
+        for iteration, row in enumerate(rows, 1):
+            row |= {"iteration": iteration, "timesteps": 10 * iteration, "episodes": 3, "seconds": 0.1 + 0.2}
+            row["mean_return"] = float("nan") if iteration == 2 else mean_return(claim.cell, iteration)
+        claim.describe(
+            settings={"policy": "MlpPolicy"}, provenance=provenance() | {"commit": "12345678e90"}, setup_seconds=0.5
+        )
+        claim.append(rows[:1])
+        claim.append(rows[1:])
+        claim.complete(rows[-1]["mean_return"])
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+    study = SweepStudy("s", str(tmp_path_factory.mktemp("sweep") / "s.journal"))
+    fill(study, CELLS)
+    return results_of(study)
+
+
+def test_there_is_a_row_for_each_seed_and_iteration(table: pd.DataFrame) -> None:
+    assert len(table) == len(CELLS) * 4
+    row = table[(table["gamma"] == 1.0) & (table["gae_lambda"] == 0.5) & (table["seed"] == 3)].iloc[2]
+    assert row["mean_return"] == mean_return(Cell("CartPole-v1", "trust_region", 1.0, 0.5, 3, 4), 3)
+    assert (row["iteration"], row["timesteps"], row["overrides"]) == (3, 30, '{"vf_steps": 2}')
+    assert (row["commit"], row["settings"], row["setup_seconds"]) == ("12345678e90", '{"policy": "MlpPolicy"}', 0.5)
+    assert row["numpy"] == np.__version__
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_exported_files_come_back_as_they_were(table: pd.DataFrame, suffix: str, tmp_path: Path) -> None:
+    if suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+    path = export(table, tmp_path / "folder" / f"results{suffix}")
+    pd.testing.assert_frame_equal(read_results(path), table)
+    export(table, path)
+    assert [found.name for found in path.parent.iterdir()] == [path.name], "nothing else is left there"
+
+
+def test_a_file_that_holds_more_or_something_else_is_not_replaced(table: pd.DataFrame, tmp_path: Path) -> None:
+    path = export(table, tmp_path / "results.csv")
+    before = path.read_bytes()
+    with pytest.raises(SweepError, match="holds 4 rows that are not in the storage; name another file"):
+        export(table[table["trial"] > 0], path)
+    with pytest.raises(SweepError, match="holds the sweep 's'; name another file"):
+        export(table.assign(sweep="other"), path)
+    assert path.read_bytes() == before
+    (tmp_path / "letter.csv").write_text("Dear Sir,\n")
+    with pytest.raises(SweepError, match="exists and is not replaced"):
+        export(table, tmp_path / "letter.csv")
+    assert (tmp_path / "letter.csv").read_text() == "Dear Sir,\n"
+
+
+def test_more_results_replace_fewer(table: pd.DataFrame, tmp_path: Path) -> None:
+    path = export(table[table["seed"] < 2], tmp_path / "results.csv")
+    export(table, path)
+    pd.testing.assert_frame_equal(read_results(path), table)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "There is no results file"),
+        ("a,b\n1,2\n", "is not a results file of a sweep"),
+        ("", "cannot be read as a results file"),
+        ("format,sweep\n7,s\n", "is of format 7, and this sb3-gae knows 1; export it anew"),
+        ("format,sweep\n1,s\n", "lacks the columns task, condition"),
+    ],
+)
+def test_other_files_are_refused(content: str | None, message: str, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / "results.csv").write_text(content)
+    with pytest.raises(SweepError) as error:
+        read_results(tmp_path / "results.csv")
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_what_cannot_be_exported(table: pd.DataFrame, tmp_path: Path) -> None:
+    with pytest.raises(SweepError, match=r"must end in \.csv, \.csv\.gz, \.parquet"):
+        export(table, tmp_path / "results.xlsx")
+    with pytest.raises(SweepError, match="nothing to export"):
+        export(table[:0], tmp_path / "results.csv")
+    (tmp_path / "file").touch()
+    with pytest.raises(SweepError, match="cannot be written"):
+        export(table, tmp_path / "file" / "results.csv")
+
+
+def test_interquartile_mean_is_that_of_rliable_and_of_its_definition() -> None:
+    values = np.random.default_rng(0).normal(size=(21, 6)) ** 3
+    direct = np.sort(values, axis=0)[5:16].mean(axis=0)
+    np.testing.assert_allclose(interquartile_mean(values), direct)
+    np.testing.assert_allclose(interquartile_mean(values), [metrics.aggregate_iqm(column[:, None]) for column in values.T])
+    np.testing.assert_allclose(estimate(values).iqm, direct)
+
+
+def test_intervals_are_those_of_a_bootstrap_over_seeds() -> None:
+    values = np.random.default_rng(1).normal(size=(12, 1))
+    result = estimate(values, resamples=4_000)
+    draws = np.random.default_rng(2).integers(0, 12, (4_000, 12))
+    direct = np.percentile(interquartile_mean(values[draws, 0].T), [2.5, 97.5])
+    np.testing.assert_allclose([result.low[0], result.high[0]], direct, atol=0.05)
+    state = np.random.get_state()[1].copy()  # type: ignore[union-attr]
+    again = estimate(values, resamples=4_000)
+    assert again == result, "the same numbers at each call"
+    np.testing.assert_array_equal(np.random.get_state()[1], state)
+    single = estimate(values[:1], resamples=10)
+    assert single.low == single.iqm == single.high == values[0]
+
+
+def test_estimates_of_several_sizes_keep_their_places() -> None:
+    samples = [np.full(4, 1.0), np.full(2, 2.0), np.full(4, 3.0)]
+    results = estimate_each(samples)
+    assert [float(result.iqm[0]) for result in results] == [1.0, 2.0, 3.0]
+    assert [result.low.shape for result in results] == [(1,)] * 3
+
+
+def test_series_are_in_order_and_bridge_iterations_without_an_episode(table: pd.DataFrame) -> None:
+    series = series_of(table)
+    assert [one.curve for one in series[:3]] == [Curve(0.9, None, "no_vf"), Curve(0.9, 1.0), Curve(0.9, 0.5)]
+    assert series[0].returns.shape == (5, 4)
+    np.testing.assert_array_equal(series[0].returns[:, 1], series[0].returns[:, 0])
+
+
+def texts(figure: Figure) -> str:
+    return "\n".join(found.get_text() for found in figure.findobj(lambda artist: hasattr(artist, "get_text")))  # type: ignore[attr-defined]
+
+
+def test_curves_have_a_band_and_a_legend(table: pd.DataFrame) -> None:
+    figure = curves_figure(table)
+    (axes,) = figure.axes
+    assert len(axes.lines) == len(axes.collections) == len(CURVES)
+    wanted = series_of(table)[2].returns
+    np.testing.assert_allclose(axes.lines[2].get_ydata(), estimate(wanted).iqm)
+    shown = texts(figure)
+    assert all(text in shown for text in ("γ = 0.9, λ = 0.5", "no value function", "5 seeds", "iteration (batch)"))
+
+
+def test_heatmap_frames_the_best_cell(table: pd.DataFrame) -> None:
+    figure = heatmap_figure(select(table, conditions=["trust_region"]))
+    axes = figure.axes[0]
+    (frame,) = axes.patches
+    assert (frame.get_x(), frame.get_y()) == (1, 1)  # type: ignore[attr-defined]
+    shown = texts(figure)
+    assert "best (framed): γ = 1, λ = 0.5: " in shown
+    assert shown.count("n = 5") == 6
+    values = axes.collections[0].get_array()
+    expected = [series.returns[:, 3] for series in series_of(table) if series.curve == Curve(0.9, 0.0)]
+    assert values is not None and np.ravel(values)[0] == pytest.approx(float(interquartile_mean(expected[0])))
+    assert texts(heatmap_figure(table, iteration=1)).count("iteration 1 ") == 1
+
+
+def test_lambda_curve_is_a_u(table: pd.DataFrame) -> None:
+    figure = lambda_figure(select(table, gammas=[0.9]))
+    lost = np.asarray(figure.axes[0].lines[0].get_ydata())
+    assert lost[1] == 0.0 and lost[0] > 0.0 < lost[2]
+    assert "no value function" in texts(figure)
+
+
+@pytest.mark.parametrize("kind", ["curves", "heatmap", "lambda"])
+def test_figures_are_the_same_bit_for_bit(kind: str, table: pd.DataFrame, tmp_path: Path) -> None:
+    chosen = table[table["gamma"] == 0.9]
+    first, second = (draw(kind, chosen, tmp_path / name) for name in ("a.b", "c"))
+    assert [path.name for path in first] == ["a.b.png", "a.b.svg"]
+    for one, other in zip(first, second, strict=True):
+        assert one.read_bytes() == other.read_bytes()
+    assert first[0].read_bytes().startswith(b"\x89PNG")
+    assert [path.name for path in draw(kind, chosen, tmp_path / "only.svg")] == ["only.svg"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        ("curves", {"gammas": [0.5]}, "no finished cell has gamma 0.5; there are 0.9, 1"),
+        ("curves", {"tasks": ["Acrobot-v1"]}, "no finished cell has task Acrobot-v1; there are CartPole-v1"),
+        ("curves", {"iterations": 9}, "no finished cell has iterations 9; there are 4"),
+        ("heatmap", {"conditions": ["no_vf"]}, "one condition that has a λ, and the selection has none"),
+        ("heatmap", {"iteration": 5}, "`iteration` must be from 1 to 4"),
+        ("lambda", {}, "at one γ, and the selection has 0.9, 1"),
+        ("lambda", {"gammas": [0.9], "lambdas": [0.5]}, "needs at least two λ"),
+        ("pie", {}, "`figure` knows curves, heatmap, lambda"),
+    ],
+)
+def test_empty_and_mixed_selections(
+    kind: str, arguments: dict[str, Any], message: str, table: pd.DataFrame, tmp_path: Path
+) -> None:
+    with pytest.raises(SweepError) as error:
+        draw(kind, table, tmp_path / "figure", **arguments)
+    assert message in str(error.value) and "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_runs_of_different_lengths_are_not_mixed(table: pd.DataFrame, tmp_path: Path) -> None:
+    both = pd.concat([table, table[table["iteration"] <= 2].assign(iterations=2)])
+    with pytest.raises(SweepError, match=r"iterations differ \(2, 4\); choose one with --of-iterations"):
+        draw("curves", both, tmp_path / "figure")
+    assert len(select(both, iterations=4)) == len(table)
+    with pytest.raises(SweepError, match="No cell has finished yet"):
+        draw("curves", table[:0], tmp_path / "figure")
+
+
+def test_rows_of_some_cells(table: pd.DataFrame) -> None:
+    assert sorted(rows_of_cells(table, CELLS[:2])["trial"].unique()) == [0, 1]

@@ -1,0 +1,219 @@
+"""Running a sweep: what a cell means, and what happens when something goes wrong."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import rl_zoo3.train
+import torch as th
+
+from sb3_gae import TRPOGAE, MujocoVecEnv
+from sb3_gae.sweep import CONDITIONS, Cell, SweepError, SweepStudy, results_of, run_sweep
+from sb3_gae.sweep.experiment import Experiment
+from sb3_gae.sweep.ledger import Outcome, Status
+from sb3_gae.sweep.plan import Options
+from sb3_gae.sweep.recorder import COLUMNS, Row
+
+HERE = Path(__file__).parent
+TINY = {"n_envs": 1, "n_steps": 32, "policy_kwargs": {"net_arch": [4]}}
+GRID: dict[str, Any] = dict(
+    env="SweepTask-v0", gammas=[0.9], lambdas=[0.5], iterations=2, gym_packages=["sweep_task"], hyperparams=TINY, name="s"
+)
+# The same on the command line
+COMMAND = """
+    -m sb3_gae.sweep run --env SweepTask-v0 --gammas .9 --lambdas .5 --iterations 2 --gym-packages sweep_task --name s
+    --no-progress -params n_envs:1 n_steps:32 policy_kwargs:dict(net_arch=[4]) --seeds"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def start(seeds: int, *arguments: str) -> "subprocess.Popen[str]":
+    paths = [str(HERE), str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    return subprocess.Popen(
+        [sys.executable, *COMMAND.split(), str(seeds), *arguments],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def runs() -> list[int]:
+    """Seeds of all runs that were begun."""
+    return [int(line) for line in Path("runs.txt").read_text().split()] if Path("runs.txt").exists() else []
+
+
+def wait_for_runs(count: int, process: "subprocess.Popen[str]") -> None:
+    until = time.monotonic() + 60.0
+    while len(runs()) < count:
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < until, "the sweep does not begin"
+        time.sleep(0.02)
+
+
+def finish(process: "subprocess.Popen[str]", code: int = 0) -> str:
+    output = process.communicate(timeout=60)[0]
+    assert process.returncode == code, output
+    return output
+
+
+def outcomes() -> list[tuple[int, str, str]]:
+    """Seed, outcome and reason of the trials that did not complete."""
+    attributes = [trial.user_attrs for trial in SweepStudy("s", create=False).trials()]
+    return [(a["cell"]["seed"], a["outcome"], a["reason"]) for a in attributes if "outcome" in a]
+
+
+def test_a_cell_is_what_the_zoo_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    params = ["gamma:0.9", "gae_lambda:0.5", "n_envs:2", "n_steps:64", "vf_optimizer:'adam'"]
+    command = "train.py --algo trpo_gae --env CartPole-v1 --seed 3 -n 384 --eval-freq 100 --verbose 0 -f logs -params"
+    monkeypatch.setattr(sys, "argv", [*command.split(), *params])
+    rl_zoo3.train.train()
+    expected = TRPOGAE.load("logs/trpo_gae/CartPole-v1_1/CartPole-v1.zip").policy.state_dict()
+    before = set(tmp_path.rglob("*"))
+
+    cell = Cell("CartPole-v1", "adam", 0.9, 0.5, 3, 3, '{"n_envs": 2, "n_steps": 64}')
+    experiment = Experiment(cell, Options())
+    rows: list[Row] = []
+    experiment.run(rows.append)
+    assert set(tmp_path.rglob("*")) == before, "a cell leaves no files"
+    assert [row["timesteps"] for row in rows] == [128, 256, 384]
+    for name, tensor in experiment.model.policy.state_dict().items():
+        assert th.equal(tensor, expected[name]), name
+    assert experiment.settings["n_steps"] == 64
+
+
+def test_rows_of_whole_episodes_are_those_of_the_batch() -> None:
+    cell = Cell("GaeCartPole-v0", "trust_region", 0.9, 0.5, 0, 2, '{"n_envs": 3}')
+    experiment = Experiment(cell, Options())
+    rows: list[Row] = []
+    returns: list[float] = []
+
+    assert isinstance(experiment.model.env, MujocoVecEnv) and experiment.model.env.n_threads == 1
+    update = experiment.model.train
+
+    def train() -> None:
+        buffer = experiment.model.rollout_buffer
+        returns.append(float(buffer.rewards[buffer.mask].sum()) / 3)
+        update()
+
+    experiment.model.train = train  # type: ignore[method-assign]
+    experiment.run(rows.append)
+    assert all(list(row) == list(COLUMNS) for row in rows)
+    assert [row["iteration"] for row in rows] == [1, 2]
+    assert [row["episodes"] for row in rows] == [3, 3]
+    # Other episodes end in the meantime, but their steps are not used
+    assert [row["mean_return"] for row in rows] == pytest.approx(returns)
+    assert experiment.model.num_timesteps - rows[-1]["timesteps"] <= 3, "it ends at the first step of the next batch"
+    assert all(np.isfinite(row["explained_variance_after"]) and row["vf_steps"] >= 1 for row in rows)
+
+
+def test_every_condition_runs() -> None:
+    table = run_sweep(seeds=1, **GRID | {"conditions": list(CONDITIONS)}, progress=False)
+    assert set(table["condition"]) == set(CONDITIONS)
+    assert table[table["condition"] == "no_vf"]["gae_lambda"].isna().all()
+
+
+def test_a_failing_cell_is_recorded_and_the_others_go_on() -> None:
+    Path("fail-1").touch()
+    with pytest.warns(UserWarning, match="seed 1, 2 iterations failed: RuntimeError: the motor is broken"):
+        table = run_sweep(seeds=3, **GRID, progress=False)
+    assert sorted(table["seed"].unique()) == [0, 2]
+    ((seed, outcome, reason),) = outcomes()
+    assert (seed, outcome) == (1, Outcome.FAILED)
+    assert reason.startswith("RuntimeError: the motor is broken [reset, sweep_task.py:") and "\n" not in reason
+    with pytest.warns(UserWarning, match="failed"):
+        run_sweep(seeds=3, **GRID, progress=False)
+    assert runs() == [0, 1, 2], "neither what is done nor what failed is run again"
+    Path("fail-1").unlink()
+    table = run_sweep(seeds=3, **GRID, progress=False, retry_failed=True)
+    assert sorted(table["seed"].unique()) == [0, 1, 2]
+    assert runs() == [0, 1, 2, 1]
+
+
+def test_results_carry_where_they_come_from() -> None:
+    table = run_sweep(seeds=1, **GRID, progress=False)
+    assert table["iteration"].tolist() == [1, 2]
+    assert set(table["torch"]) == {th.__version__}
+    assert json.loads(table["settings"][0]) | {"n_steps": 32, "gamma": 0.9, "batched_envs": True} == json.loads(
+        table["settings"][0]
+    )
+    larger = run_sweep(seeds=2, **GRID, progress=False)
+    assert len(larger) == 4 and runs() == [0, 1]
+    pd.testing.assert_frame_equal(run_sweep(seeds=1, **GRID, progress=False), table)
+
+
+@pytest.mark.parametrize(("number", "outcome"), [(signal.SIGKILL, Outcome.LOST), (signal.SIGTERM, Outcome.STOPPED)])
+def test_a_sweep_that_was_ended_resumes(number: signal.Signals, outcome: Outcome) -> None:
+    Path("hold-1").touch()
+    process = start(3)
+    wait_for_runs(2, process)
+    process.send_signal(number)
+    if number == signal.SIGKILL:
+        finish(process, -signal.SIGKILL)
+        Path("hold-1").unlink()
+    else:
+        Path("hold-1").unlink()
+        assert "1 done" in finish(process, 130)
+    table = run_sweep(seeds=3, **GRID, progress=False)
+    assert runs() == [0, 1, 1, 2], "what was done is not run again, what was not begins anew"
+    assert sorted(table["seed"]) == [0, 0, 1, 1, 2, 2]
+    assert [(seed, found) for seed, found, _ in outcomes()] == [(1, outcome)]
+
+
+def test_a_worker_that_is_killed_is_replaced() -> None:
+    Path("hold-1").touch()
+    sweep = threading.Thread(target=run_sweep, kwargs=dict(seeds=3, **GRID, jobs=2, progress=False))
+    sweep.start()
+    while 1 not in runs():
+        assert sweep.is_alive()
+        time.sleep(0.02)
+    trials = SweepStudy("s", create=False).trials()
+    (held,) = [trial for trial in trials if trial.user_attrs["cell"]["seed"] == 1]
+    os.kill(held.user_attrs["sign_of_life"]["pid"], signal.SIGKILL)
+    Path("hold-1").unlink()
+    sweep.join()
+    assert sorted(runs()) == [0, 1, 1, 2]
+    assert [(seed, outcome) for seed, outcome, _ in outcomes()] == [(1, Outcome.LOST)]
+    assert [standing.status for standing in SweepStudy("s").standings().values()] == [Status.DONE] * 3
+
+
+def test_two_commands_share_a_grid() -> None:
+    processes = [start(8), start(8)]
+    outputs = [finish(process) for process in processes]
+    assert sorted(runs()) == list(range(8)), "each cell is run once"
+    table = SweepStudy("s", create=False).standings()
+    assert [standing.status for standing in table.values()] == [Status.DONE] * 8
+    assert any("8 done" in output for output in outputs)
+    assert len(results_of(SweepStudy("s", create=False))) == 16
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"env": "SweepTsk-v0"}, "did you mean 'SweepTask-v0'?"),
+        ({"gym_packages": ["no_such_module"]}, "no_such_module cannot be imported"),
+        ({"jobs": 0}, "`jobs` must be at least 1"),
+        ({"conf_file": "nowhere.yml"}, "no settings of SweepTask-v0 in nowhere.yml"),
+        ({"hyperparams": {"n_step": 8}}, "did you mean 'n_steps'?"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_anything_is_stored(changes: dict[str, Any], message: str) -> None:
+    import sweep_task  # noqa: F401
+
+    with pytest.raises(SweepError) as error:
+        run_sweep(seeds=1, **GRID | changes, progress=False)
+    assert message in str(error.value) and "\n" not in str(error.value)
+    assert not Path("logs").exists()

@@ -1,0 +1,231 @@
+"""A sweep in its storage: who may run a cell, and what becomes of those whose process is gone."""
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from sb3_gae.sweep import Cell, SweepError, SweepStudy
+from sb3_gae.sweep.ledger import MAX_LOST, Outcome, Status
+from sb3_gae.sweep.liveness import sign_of_life, why_dead
+from sb3_gae.sweep.study import TakenOverError
+
+CELLS = [Cell("CartPole-v1", "trust_region", 0.9, value, 0, 3) for value in (0.0, 0.5, 1.0)]
+ROW = {"iteration": 1, "mean_return": 5.0}
+
+
+@pytest.fixture(params=["journal", "sqlite"])
+def location(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    return str(tmp_path / "sweep.journal") if request.param == "journal" else f"sqlite:///{tmp_path}/sweep.db"
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> str:
+    return str(tmp_path / "sweep.journal")
+
+
+def statuses(study: SweepStudy) -> list[Status]:
+    table = study.standings()
+    return [table[cell.key].status for cell in CELLS]
+
+
+def test_cells_are_asked_for_once_and_end_as_they_are_told(location: str) -> None:
+    study = SweepStudy("s", location)
+    for _ in range(2):
+        study.enqueue(CELLS)
+    assert len(study.trials()) == 3
+    first, second = study.claim(CELLS), study.claim(CELLS)
+    assert first is not None and second is not None
+    assert (first.cell, second.cell) == (CELLS[0], CELLS[1])
+    first.append([ROW])
+    first.complete(5.0)
+    second.give_up(Outcome.FAILED, "no luck")
+    assert statuses(SweepStudy("s", location)) == [Status.DONE, Status.FAILED, Status.WAITING]
+    assert study.standings()[CELLS[1].key].reason == "no luck"
+    trial = study.trials()[0]
+    assert (trial.value, trial.intermediate_values, trial.params["gamma"]) == (5.0, {1: 5.0}, 0.9)
+
+
+def test_failed_cells_are_only_run_again_if_asked_for(journal: str) -> None:
+    study = SweepStudy("s", journal)
+    for outcome in (Outcome.FAILED, Outcome.STOPPED):
+        study.enqueue(CELLS[:1])
+        claim = study.claim(CELLS[:1])
+        if claim is not None:
+            claim.give_up(outcome, outcome)
+        study.enqueue(CELLS[:1], retry_failed=outcome == Outcome.FAILED)
+    # Asked for anew after it failed, run, stopped and asked for anew
+    assert study.standings()[CELLS[0].key][::2] == (Status.WAITING, 2)
+
+
+def test_two_machines_that_ask_at_the_same_moment_run_a_cell_once(location: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    here, there = SweepStudy("s", location), SweepStudy("s", location)
+    here.enqueue(CELLS)
+    with monkeypatch.context() as patch:
+        patch.setattr(there, "standings", dict)  # it looked before the other one wrote
+        patch.setattr("sb3_gae.sweep.study.duplicates", lambda trials: [])
+        there.enqueue(CELLS)
+    assert len(here.trials()) == 6
+    claims = [study.claim(CELLS) for study in (here, there, here, there)]
+    assert [claim and claim.cell for claim in claims] == [*CELLS, None]
+    here.enqueue(CELLS)
+    ended = [trial for trial in here.trials() if trial.state == TrialState.FAIL]
+    assert [trial.user_attrs["outcome"] for trial in ended] == [Outcome.DUPLICATE] * 3
+
+
+def test_many_workers_take_each_cell_once(location: str) -> None:
+    cells = [Cell("CartPole-v1", "trust_region", 0.9, 0.5, seed, 3) for seed in range(24)]
+    SweepStudy("s", location).enqueue(cells)
+    studies = [SweepStudy("s", location) for _ in range(4)]
+    taken: list[int] = []
+    begin = threading.Barrier(len(studies))
+
+    def work(study: SweepStudy) -> None:
+        begin.wait()
+        while (claim := study.claim(cells)) is not None:
+            taken.append(claim.cell.seed)
+
+    threads = [threading.Thread(target=work, args=(study,)) for study in studies]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert sorted(taken) == list(range(24))
+
+
+def test_cells_of_a_dead_process_are_taken_over(journal: str) -> None:
+    study = SweepStudy("s", journal)
+    study.enqueue(CELLS[:1])
+    claim = study.claim(CELLS[:1])
+    assert claim is not None
+    assert study.take_back() == []
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    claim.describe(sign_of_life=sign_of_life() | {"pid": dead.pid})
+    again = SweepStudy("s", journal).claim(CELLS[:1])
+    assert again is not None and again.cell == CELLS[0]
+    assert study.trials()[0].user_attrs["reason"] == f"process {dead.pid} on {socket.gethostname()} ended without a word"
+    with pytest.raises(TakenOverError):
+        claim.append([ROW])
+
+
+def test_a_cell_that_takes_its_process_along_counts_as_failed(journal: str) -> None:
+    study = SweepStudy("s", journal, silent_after=-1.0)
+    study.enqueue(CELLS[:1])
+    for _ in range(MAX_LOST):
+        assert study.standings()[CELLS[0].key].status == Status.WAITING
+        assert study.claim(CELLS[:1]) is not None
+        study.take_back()
+        study.enqueue(CELLS[:1])
+    assert study.standings()[CELLS[0].key].status == Status.FAILED
+
+
+def test_signs_of_life() -> None:
+    sign = sign_of_life()
+    assert why_dead(sign, time.time()) is None
+    assert why_dead(sign | {"host": "elsewhere", "pid": 1}, time.time()) is None
+    assert "no sign of life for 1000 s" in str(why_dead(sign, sign["time"] + 1000.0))
+    if Path("/proc/self/stat").exists():
+        # The number belongs to another process by now
+        assert why_dead(sign | {"started": sign["started"] - 1}, time.time()) is not None
+
+
+@pytest.mark.parametrize("torn", ['{"op_code":8,"worker_id":"x', "x" * 3_000_000], ids=["short", "long"])
+def test_a_journal_survives_a_write_that_was_cut_off(journal: str, torn: str) -> None:
+    study = SweepStudy("s", journal)
+    study.enqueue(CELLS)
+    with Path(journal).open("a") as file:
+        file.write(torn)
+    claim = SweepStudy("s", journal).claim(CELLS)
+    assert claim is not None
+    claim.complete(1.0)
+    assert statuses(study) == [Status.DONE, Status.WAITING, Status.WAITING]
+    assert torn not in Path(journal).read_text()
+
+
+def test_a_lock_that_was_left_behind_does_not_stop_the_sweep_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    study = SweepStudy("s", "folder/sweep.journal")
+    lock = study.storage._backend._lock  # type: ignore[attr-defined]
+    lock.grace_period = 0.2
+    lock.acquire()
+    # A dangling link would never be seen to grow old
+    assert Path("folder/sweep.journal.lock").exists()
+    study.enqueue(CELLS[:1])
+    assert len(study.trials()) == 1
+
+
+def test_other_settings_are_refused(journal: str) -> None:
+    SweepStudy("s", journal).check_settings({"T": {"n_steps": 8, "n_envs": 2}})
+    study = SweepStudy("s", journal)
+    study.check_settings({"T": {"n_envs": 2, "n_steps": 8}, "U": {}})
+    with pytest.raises(SweepError, match="n_steps 8 -> 16"):
+        study.check_settings({"T": {"n_steps": 16, "n_envs": 2}})
+
+
+def storage_of(location: str) -> optuna.storages.BaseStorage:
+    return optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(location))
+
+
+def test_other_formats_and_other_studies_are_refused(journal: str) -> None:
+    study = optuna.create_study(storage=storage_of(journal), study_name="s")
+    study.set_user_attr("sb3_gae_sweep_format", 99)
+    optuna.create_study(storage=storage_of(journal), study_name="other").add_trial(optuna.trial.create_trial(value=1.0))
+    before = Path(journal).read_bytes()
+    with pytest.raises(SweepError, match=r"is of format 99, and this sb3-gae knows 1; use the sb3-gae that wrote it"):
+        SweepStudy("s", journal)
+    with pytest.raises(SweepError, match=r"is no sweep of sb3-gae; choose another --name"):
+        SweepStudy("other", journal)
+    assert Path(journal).read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("location", "message"),
+    [
+        ("{tmp}/file/x.journal", "cannot be reached"),
+        ("{tmp}", "cannot be reached"),
+        ("{tmp}/file", "is not one of Optuna's, or it is damaged"),
+        ("sqlite:///{tmp}/nowhere/x.db", "cannot be reached"),
+        ("sqlite:///{tmp}/file", "cannot be reached"),
+        ("nosuchbase://host/x", "cannot be reached"),
+        ("mysql+pymysql://me:secret@localhost/x", "needs a driver that is not installed"),
+    ],
+)
+def test_storages_that_cannot_be_used(location: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("these are\nno results\n")
+    with pytest.raises(SweepError) as error:
+        SweepStudy("s", location.format(tmp=tmp_path))
+    assert message in str(error.value)
+    assert "\n" not in str(error.value) and "secret" not in str(error.value)
+    assert (tmp_path / "file").read_text() == "these are\nno results\n"
+
+
+def test_a_locked_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sqlite3
+
+    location = f"sqlite:///{tmp_path}/sweep.db"
+    SweepStudy("s", location)
+    monkeypatch.setattr("sb3_gae.sweep.storage._LOCK_SECONDS", 0.1)
+    holder = sqlite3.connect(tmp_path / "sweep.db")
+    holder.execute("BEGIN EXCLUSIVE")
+    with pytest.raises(SweepError, match=r"is locked by another program; wait for it, or pass another --storage"):
+        SweepStudy("s", location)
+    holder.close()
+
+
+def test_what_is_not_there_is_not_made(tmp_path: Path) -> None:
+    with pytest.raises(SweepError, match="There is no sweep at"):
+        SweepStudy("s", str(tmp_path / "sweep.journal"), create=False)
+    assert not list(tmp_path.iterdir())
+    SweepStudy("s", str(tmp_path / "sweep.journal"))
+    with pytest.raises(SweepError, match=r"no sweep 'other' in .*: it holds s"):
+        SweepStudy("other", str(tmp_path / "sweep.journal"), create=False)
+    with pytest.raises(SweepError, match="without slashes"):
+        SweepStudy(f"a{os.sep}b")
