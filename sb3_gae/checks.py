@@ -51,6 +51,17 @@ def check_choice(name: str, value: Any, choices: tuple[Any, ...]) -> None:
         raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
 
 
+def check_unit_interval(name: str, factors: Any) -> None:
+    """
+    :param name: of the argument, for the message
+    :param factors: what was passed
+    :raises ValueError: if it is not a list of numbers from 0 to 1, or is empty
+    """
+    array = np.asarray(factors, dtype=np.float64)
+    if array.ndim != 1 or array.size == 0 or not np.all((array >= 0.0) & (array <= 1.0)):
+        raise ValueError(f"`{name}` must be a non-empty list of numbers in [0, 1], got {factors!r}.")
+
+
 def check_finite_parameters(module: nn.Module) -> None:
     """
     :param module: any

@@ -16,6 +16,7 @@ from sb3_gae.advantages import (
     next_state_values,
     td_residuals,
 )
+from sb3_gae.checks import check_unit_interval
 from sb3_gae.diagnostics import explained_variance
 
 
@@ -173,8 +174,8 @@ class GAERolloutBuffer(RolloutBuffer):
         :raises ValueError: if the buffer is not full, or a factor is out of range
         """
         self._check_full()
-        _check_unit_interval("gammas", gammas)
-        _check_unit_interval("lambdas", lambdas)
+        check_unit_interval("gammas", gammas)
+        check_unit_interval("lambdas", lambdas)
         return advantage_grid(self.rewards, self.values, self.next_values, self.dones, gammas, lambdas)
 
     def lambda_sweep(self, lambdas: Sequence[float], gamma: float | None = None) -> LambdaSweep:
@@ -245,9 +246,3 @@ class GAEDictRolloutBuffer(GAERolloutBuffer, DictRolloutBuffer):
     def _get_samples(self, batch_inds: np.ndarray | slice, env: VecNormalize | None = None) -> Any:
         observations = {key: self._samples_of(array, batch_inds) for key, array in self.observations.items()}
         return DictRolloutBufferSamples(observations, *self._scalars_of(batch_inds))
-
-
-def _check_unit_interval(name: str, factors: Sequence[float]) -> None:
-    array = np.asarray(factors, dtype=np.float64)
-    if array.ndim != 1 or array.size == 0 or not np.all((array >= 0.0) & (array <= 1.0)):
-        raise ValueError(f"`{name}` must be a non-empty list of numbers in [0, 1], got {factors!r}.")

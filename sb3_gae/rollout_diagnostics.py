@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae.advantages import advantage_grid, td_residuals
-from sb3_gae.checks import check_count, check_number
+from sb3_gae.checks import check_count, check_number, check_unit_interval
 from sb3_gae.collection import training_batch
 from sb3_gae.diagnostics import lagged_signal
 from sb3_gae.gradient_diagnostics import policy_gradients
@@ -87,7 +87,7 @@ def lambda_errors(
     :return: see :class:`LambdaErrors`
     :raises ValueError: if the buffer is not full, has a single trajectory, or a factor is out of range
     """
-    _check_factors("lambdas", lambdas)
+    check_unit_interval("lambdas", lambdas)
     gamma = _checked_gamma(rollout_buffer, gamma)
     rewards, values, next_values = _td_arrays(rollout_buffer)
     advantages = advantage_grid(rewards, values, next_values, rollout_buffer.dones, [gamma], [*lambdas, 1.0])[0]
@@ -189,9 +189,3 @@ def _checked_gamma(rollout_buffer: GAERolloutBuffer, gamma: float | None) -> flo
     gamma = rollout_buffer.gamma if gamma is None else gamma
     check_number("gamma", gamma, 0.0, 1.0)
     return gamma
-
-
-def _check_factors(name: str, factors: Sequence[float]) -> None:
-    array = np.asarray(factors, dtype=np.float64)
-    if array.ndim != 1 or array.size == 0 or not np.all((array >= 0.0) & (array <= 1.0)):
-        raise ValueError(f"`{name}` must be a non-empty list of numbers in [0, 1], got {factors!r}.")

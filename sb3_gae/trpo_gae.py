@@ -4,6 +4,7 @@ import copy
 import io
 import pathlib
 import warnings
+from collections.abc import Callable
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -33,6 +34,7 @@ from sb3_gae.collection import (
 )
 from sb3_gae.episode_quota import EpisodeQuota
 from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
+from sb3_gae.lambda_rules import LambdaRule, lambda_rule
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gae.policy_step import policy_parameters, policy_step
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
@@ -66,7 +68,10 @@ class TRPOGAE(OnPolicyAlgorithm):
     :param line_search_shrinking_factor: each further trial of a step is this times as long
     :param line_search_max_iter: largest number of trials
     :param n_critic_updates: Adam's epochs; read only with ``vf_optimizer="adam"`` (default: 10)
-    :param gae_lambda: :math:`\lambda` of the advantages: 0 trusts the value function, 1 the returns
+    :param gae_lambda: :math:`\lambda` of the advantages: 0 trusts the value function, 1 the returns. A function of the
+        remaining progress for a schedule; ``"auto"`` to choose it by the measured error of the policy gradient
+        (:class:`~sb3_gae.lambda_rules.MeasuredLambda`); ``"explained_variance"`` for the simple rule that this is to be
+        compared with. The attribute ``gae_lambda`` is always the number in use
     :param use_sde: whether to use generalized state-dependent exploration
     :param sde_sample_freq: sample a new noise matrix every so many steps; -1 only at the start of a rollout
     :param rollout_buffer_class: a subclass of :class:`~sb3_gae.GAERolloutBuffer`; None to choose by the observations
@@ -127,7 +132,7 @@ class TRPOGAE(OnPolicyAlgorithm):
         line_search_shrinking_factor: float = 0.8,
         line_search_max_iter: int = 10,
         n_critic_updates: int | None = None,
-        gae_lambda: float = 0.95,
+        gae_lambda: float | str | Callable[[float], float] = 0.95,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         rollout_buffer_class: type[RolloutBuffer] | None = None,
@@ -163,7 +168,7 @@ class TRPOGAE(OnPolicyAlgorithm):
             learning_rate=1e-3 if learning_rate is None else learning_rate,
             n_steps=n_steps,
             gamma=gamma,
-            gae_lambda=gae_lambda,
+            gae_lambda=gae_lambda,  # type: ignore[arg-type]
             ent_coef=0.0,
             vf_coef=0.0,
             max_grad_norm=0.0,
@@ -205,10 +210,13 @@ class TRPOGAE(OnPolicyAlgorithm):
         self.value_fit_first = value_fit_first
         self._numerical_failures = 0
         self._time_baseline = TimeBaseline()
+        self._lambda_rule: LambdaRule | None = None
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
+        if (rule := lambda_rule(self.gae_lambda)) is not None:
+            self._lambda_rule, self.gae_lambda = rule, rule.value(1.0)
         check_hyperparameters(vars(self))
         if self.rollout_buffer_class is None:
             is_dict = isinstance(self.observation_space, spaces.Dict)
@@ -278,7 +286,11 @@ class TRPOGAE(OnPolicyAlgorithm):
         if self.n_episodes is not None:
             self._finish_episodes(rollout_buffer, quota)
         self._rollout_end = RolloutEnd(terminal, self._last_obs, self._last_episode_starts)
+        if self._lambda_rule is not None:
+            self.gae_lambda = self._lambda_rule.value(self._current_progress_remaining)
         self._estimate_advantages(rollout_buffer)
+        if self._lambda_rule is not None:
+            self._learn_lambda(self._lambda_rule, rollout_buffer)
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
@@ -288,6 +300,11 @@ class TRPOGAE(OnPolicyAlgorithm):
         self._numerical_failures += sum(bool(info.get("numerical_failure")) for info in infos)
         if self._numerical_failures:
             self.logger.record("rollout/numerical_failures", self._numerical_failures)
+
+    def _learn_lambda(self, rule: LambdaRule, rollout_buffer: GAERolloutBuffer) -> None:
+        self.logger.record("gae_lambda/value", self.gae_lambda)
+        for name, value in rule.learn_from(self.policy, rollout_buffer).items():
+            self.logger.record(f"gae_lambda/{name}", value)
 
     def _finish_episodes(self, rollout_buffer: GAERolloutBuffer, quota: EpisodeQuota) -> None:
         rollout_buffer.finish()
@@ -443,4 +460,7 @@ class TRPOGAE(OnPolicyAlgorithm):
         :raises ValueError: if the file is damaged, or was saved by another algorithm
         """
         check_saved_file(path)
+        if "gae_lambda" in kwargs:
+            # A rule that was saved would overrule it
+            kwargs["_lambda_rule"] = None
         return super().load(path, env, *args, **kwargs)
