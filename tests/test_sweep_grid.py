@@ -48,6 +48,8 @@ def test_seeds_are_outermost_and_overrides_have_no_order() -> None:
     [
         ("trust_region", {}),
         ("no_vf", {"baseline": "time"}),
+        ("measured_lambda", {"gae_lambda": "auto"}),
+        ("explained_variance_lambda", {"gae_lambda": "explained_variance"}),
         ("value_first", {"value_fit_first": True}),
         ("adam", {"vf_optimizer": "adam"}),
         ("mc_targets", {"value_lambda": 1.0}),
@@ -55,7 +57,7 @@ def test_seeds_are_outermost_and_overrides_have_no_order() -> None:
     ],
 )
 def test_conditions_are_arguments(condition: str, settings: dict[str, Any]) -> None:
-    of_lambda = {} if condition == "no_vf" else {"gae_lambda": 0.5}
+    of_lambda = {} if condition == "no_vf" or condition.endswith("_lambda") else {"gae_lambda": 0.5}
     assert Cell("T", condition, 0.9, 0.5, 0, 1).hyperparameters == {"gamma": 0.9} | settings | of_lambda
     assert set(CONDITIONS[condition].settings) <= set(inspect.signature(TRPOGAE).parameters)
 

@@ -13,7 +13,7 @@ class Condition:
     """
     :param title: for legends
     :param settings: arguments of TRPOGAE
-    :param uses_lambda: whether the advantages depend on λ
+    :param uses_lambda: whether λ is given to it
     """
 
     title: str
@@ -25,6 +25,10 @@ class Condition:
 CONDITIONS: dict[str, Condition] = {
     "trust_region": Condition("value function by trust region"),
     "no_vf": Condition("no value function", {"baseline": "time"}, uses_lambda=False),
+    "measured_lambda": Condition("λ by the measured gradient error", {"gae_lambda": "auto"}, uses_lambda=False),
+    "explained_variance_lambda": Condition(
+        "λ by the explained variance", {"gae_lambda": "explained_variance"}, uses_lambda=False
+    ),
     "value_first": Condition("value function before policy", {"value_fit_first": True}),
     "adam": Condition("value function by Adam", {"vf_optimizer": "adam"}),
     "mc_targets": Condition("Monte-Carlo targets", {"value_lambda": 1.0}),
