@@ -1,6 +1,5 @@
 """Trust-region policy optimization with generalized advantage estimation."""
 
-import copy
 import io
 import pathlib
 import warnings
@@ -14,7 +13,7 @@ from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule, TensorDict
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gae.adam_fit import adam_fit
@@ -38,7 +37,7 @@ from sb3_gae.lambda_rules import LambdaRule, lambda_rule
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gae.policy_step import policy_parameters, policy_step
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
-from sb3_gae.saved_file import check_saved_file
+from sb3_gae.saved_model import SavedModel
 from sb3_gae.time_baseline import TimeBaseline
 from sb3_gae.trust_region import StepRecord, TrustRegionSettings
 from sb3_gae.update_summary import update_summary
@@ -46,7 +45,7 @@ from sb3_gae.value_head import ValueHead
 from sb3_gae.value_step import ValueFitRecord, value_parameters, value_steps
 
 
-class TRPOGAE(OnPolicyAlgorithm):
+class TRPOGAE(SavedModel, OnPolicyAlgorithm):
     r"""
     Trust-region policy optimization with generalized advantage estimation and a trust-region value function.
 
@@ -427,39 +426,8 @@ class TRPOGAE(OnPolicyAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_rollout_end"]
 
-    def set_parameters(
-        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
-    ) -> None:
-        """
-        As SB3's, but all or nothing: if anything does not fit, every parameter is as it was.
-
-        :param load_path_or_dict: a saved file, or what :meth:`get_parameters` returns
-        :param exact_match: whether every parameter must be given
-        :param device: on which to load
-        :raises ValueError: if something does not fit, or the file is damaged
-        """
-        if not isinstance(load_path_or_dict, dict):
-            check_saved_file(load_path_or_dict, own=False)
-        before = copy.deepcopy(self.get_parameters())
-        try:
-            super().set_parameters(load_path_or_dict, exact_match, device)
-        except Exception:
-            super().set_parameters(before)  # type: ignore[arg-type]
-            raise
-
     @classmethod
     def load(cls, path: str | pathlib.Path | io.BufferedIOBase, env: GymEnv | None = None, *args: Any, **kwargs: Any) -> Self:
-        """
-        As SB3's, after looking whether the file is whole and one of ours.
-
-        :param path: a saved file
-        :param env: to continue training on
-        :param args: as SB3's
-        :param kwargs: as SB3's; further ones replace what was saved
-        :return: a new model
-        :raises ValueError: if the file is damaged, or was saved by another algorithm
-        """
-        check_saved_file(path)
         if "gae_lambda" in kwargs:
             # A rule that was saved would overrule it
             kwargs["_lambda_rule"] = None
