@@ -3,11 +3,13 @@ What the shipped settings reach on the paper's tasks: rl-zoo3's own command over
 
     python benchmarks/paper_tasks.py                          # every run that is not stored yet: hours
     python benchmarks/paper_tasks.py --tasks GaeBiped-v0 --seeds 0 1 2 --jobs 2
+    python benchmarks/paper_tasks.py --tasks GaeBiped-v0 --seeds 1000 --steps 50_000_000   # the paper's 1 000 iterations
     python benchmarks/paper_tasks.py --report                 # runs nothing: the table, and the figure in docs/images
 
 Each run is ``python -m rl_zoo3.train --algo trpo_gae --env TASK --seed SEED`` with nothing else set, then the last
 agent (not the best) plays 20 episodes, deterministically, in the gymnasium environment. A row and a curve are stored
-as each run ends; what is stored is not run again. ``--steps`` trains for other than the shipped number of steps.
+as each run ends; what is stored is not run again. ``--steps`` trains for other than the shipped number of steps; the
+figure has the seeds that are run by default.
 """
 
 import argparse
@@ -127,10 +129,12 @@ def stored(path: Path) -> list[dict[str, str]]:
 
 def table() -> None:
     """Interquartile means over seeds with bootstrap intervals of 95 %, as rliable computes them."""
-    for env in TASKS:
-        rows = [row for row in stored(RESULTS) if row["env"] == env]
-        if not rows:
-            continue
+    results = stored(RESULTS)
+    # One line for each length of training
+    for env, steps in sorted(
+        {(row["env"], int(row["steps"])) for row in results}, key=lambda one: (list(TASKS).index(one[0]), one[1])
+    ):
+        rows = [row for row in results if (row["env"], int(row["steps"])) == (env, steps)]
         print(f"{env}, {len(rows)} seeds, {rows[0]['steps']} steps in {'/'.join(row['train_seconds'] for row in rows)} s")
         for name in ("mean_return", "mean_length", "forward_velocity", "head_height"):
             values = np.array([float(row[name]) for row in rows])
@@ -158,7 +162,7 @@ def figure() -> None:
     plt.rcParams.update({"font.size": 9, "svg.hashsalt": "sb3-gae", "axes.spines.top": False, "axes.spines.right": False})
     drawing, axes = plt.subplots(1, len(tasks), figsize=(3.2 * len(tasks), 2.9), squeeze=False, facecolor="white")
     for axis, env in zip(axes[0], tasks, strict=True):
-        seeds = sorted({int(point["seed"]) for point in points if point["env"] == env})
+        seeds = sorted({int(point["seed"]) for point in points if point["env"] == env} & set(TASKS[env].seeds))
         for seed in seeds:
             own = [point for point in points if point["env"] == env and int(point["seed"]) == seed]
             steps = np.array([float(point["steps"]) for point in own]) / 1e6
