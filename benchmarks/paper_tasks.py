@@ -3,7 +3,7 @@ What the shipped settings reach on the paper's tasks: rl-zoo3's own command over
 
     python benchmarks/paper_tasks.py                          # every run that is not stored yet: hours
     python benchmarks/paper_tasks.py --tasks GaeBiped-v0 --seeds 0 1 2 --jobs 2
-    python benchmarks/paper_tasks.py --tasks GaeBiped-v0 --seeds 1000 --steps 50_000_000   # the paper's 1 000 iterations
+    python benchmarks/paper_tasks.py --tasks GaeBiped-v0 --seeds 1000 --steps 50000000   # the paper's 1 000 iterations
     python benchmarks/paper_tasks.py --report                 # runs nothing: the table, and the figure in docs/images
 
 Each run is ``python -m rl_zoo3.train --algo trpo_gae --env TASK --seed SEED`` with nothing else set, then the last
@@ -25,11 +25,13 @@ from typing import NamedTuple
 import gymnasium as gym
 import matplotlib
 import numpy as np
+import yaml
 from rliable import library, metrics
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_gae import TRPOGAE
+from sb3_gae.zoo import default_hyperparams_path
 
 RESULTS = Path(__file__).parent / "results" / "paper_tasks.csv"
 CURVES = RESULTS.with_name("paper_tasks_curves.csv")
@@ -76,7 +78,12 @@ def run(env: str, seed: int, steps: int | None, folder: Path) -> tuple[dict[str,
 
 
 def curve(agent: Path) -> list[dict[str, object]]:
-    """Mean return of the training episodes that ended in each hundredth of the training."""
+    """
+    Mean return of the training episodes that ended in each hundredth of the training.
+
+    From the monitor files: with batches of whole episodes they also have the surplus ones of environments that had
+    contributed all of theirs.
+    """
     episodes = load_results(str(agent))
     steps, returns = episodes["l"].cumsum().to_numpy(), episodes["r"].to_numpy()
     edges = np.linspace(0, steps[-1], POINTS + 1)
@@ -118,6 +125,15 @@ def store(path: Path, columns: list[str], rows: list[dict[str, object]]) -> None
         if new:
             writer.writeheader()
         writer.writerows(rows)
+
+
+def is_known(env: str, seed: int, steps: int | None) -> bool:
+    """Whether such a run is stored; the last batch of a run goes beyond what was asked for."""
+    asked = steps or int(float(yaml.safe_load(default_hyperparams_path().read_text())[env]["n_timesteps"]))
+    return any(
+        (row["env"], int(row["seed"])) == (env, seed) and 0 <= int(row["steps"]) - asked < 0.02 * asked
+        for row in stored(RESULTS)
+    )
 
 
 def stored(path: Path) -> list[dict[str, str]]:
@@ -207,9 +223,8 @@ def main() -> None:
     args = parser.parse_args()
     failures: list[str] = []
     if not args.report:
-        known = {(row["env"], int(row["seed"])) for row in stored(RESULTS)}
         wanted = [(env, seed) for env in args.tasks for seed in args.seeds or TASKS[env].seeds]
-        left = [pair for pair in wanted if pair not in known]
+        left = [pair for pair in wanted if not is_known(*pair, args.steps)]
         failures = run_all(left, args)
     table()
     if stored(CURVES):

@@ -180,8 +180,8 @@ def compare(task: Task, rounds: int) -> bool:
         limits.append(limit())
         physics.seconds = policy.seconds = 0.0
         ours.iterate()
-        in_update = policy.seconds
-        shares.append((physics.seconds, in_update))
+        in_policy = policy.seconds
+        shares.append((physics.seconds, in_policy))
         for peer in peers.values():
             peer.iterate()
     return report(task, ours, peers, limits[1:], shares[1:])

@@ -80,6 +80,11 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
     check_choice("vf_optimizer", values["vf_optimizer"], ("trust_region", "adam"))
     check_choice("baseline", values["baseline"], ("value", "time"))
     check_choice("value_fit_first", values["value_fit_first"], (False, True))
+    if values["baseline"] == "time" and (values["value_fit_first"] or values["_lambda_rule"] is not None):
+        raise ValueError(
+            "`baseline` = 'time' has neither a value function to fit first nor a lambda to choose; leave out "
+            "`value_fit_first`, and give `gae_lambda` a number or nothing."
+        )
     _check_batch(values["n_steps"], values["n_envs"], values["sub_sampling_factor"], values["n_episodes"])
     _check_buffer_class(values["rollout_buffer_class"])
     if "value_lambda" in values["rollout_buffer_kwargs"]:

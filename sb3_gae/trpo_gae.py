@@ -269,11 +269,9 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
                 return False
 
             counts = quota.counts
-            ended = dones if counts is None else dones & counts
             truncated = np.zeros(env.num_envs, dtype=bool)
-            if ended.any():
-                self._record_endings([infos[i] for i in np.flatnonzero(ended)])
-                endings = terminal_observations(n_steps, ended, infos)
+            if dones.any():
+                endings = self._record_endings(n_steps, dones, dones if counts is None else dones & counts, infos)
                 terminal.extend(endings)
                 truncated[[ending.env for ending in endings]] = True
             rollout_buffer.add_step(self._last_obs, actions, rewards, self._last_episode_starts, dones, truncated, counts)
@@ -294,11 +292,16 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
-    def _record_endings(self, infos: list[dict[str, Any]]) -> None:
-        self._update_info_buffer(infos, np.ones(len(infos), dtype=bool))
-        self._numerical_failures += sum(bool(info.get("numerical_failure")) for info in infos)
+    def _record_endings(
+        self, step: int, dones: np.ndarray, counted: np.ndarray, infos: list[dict[str, Any]]
+    ) -> list[TerminalObservation]:
+        """Log the episodes of the batch that ended in a step, and return those that a time limit ended."""
+        ended = [infos[env] for env in np.flatnonzero(counted)]
+        self._update_info_buffer(ended, np.ones(len(ended), dtype=bool))
+        self._numerical_failures += sum(bool(infos[env].get("numerical_failure")) for env in np.flatnonzero(dones))
         if self._numerical_failures:
             self.logger.record("rollout/numerical_failures", self._numerical_failures)
+        return terminal_observations(step, counted, infos)
 
     def _learn_lambda(self, rule: LambdaRule, rollout_buffer: GAERolloutBuffer) -> None:
         self.logger.record("gae_lambda/value", self.gae_lambda)
@@ -428,7 +431,7 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
 
     @classmethod
     def load(cls, path: str | pathlib.Path | io.BufferedIOBase, env: GymEnv | None = None, *args: Any, **kwargs: Any) -> Self:
-        if "gae_lambda" in kwargs:
+        if "gae_lambda" in kwargs or "gae_lambda" in (kwargs.get("custom_objects") or {}):
             # A rule that was saved would overrule it
             kwargs["_lambda_rule"] = None
         return super().load(path, env, *args, **kwargs)

@@ -161,6 +161,12 @@ def test_bad_choices_are_refused(name: str, value: Any) -> None:
         small_model(vec_env(), **{name: value})
 
 
+@pytest.mark.parametrize("other", [{"value_fit_first": True}, {"gae_lambda": "auto"}, {"gae_lambda": lambda progress: 0.9}])
+def test_what_a_baseline_of_time_has_no_part_for_is_refused(other: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="`baseline` = 'time' has neither"):
+        small_model(vec_env(), baseline="time", **other)
+
+
 def test_the_baseline_goes_on_after_saving_and_loading(tmp_path: Path) -> None:
     model = small_model(vec_env(), baseline="time")
     train_once(model)

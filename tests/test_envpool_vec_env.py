@@ -107,11 +107,16 @@ class Twin:
 IN_THREE_DIMENSIONS = {"Ant-v5": 13 + 14, "Humanoid-v5": 22 + 23, "HumanoidStandup-v5": 22 + 23}
 
 
-def tolerances(task: str, size: int) -> np.ndarray:
-    """Of each observed number. EnvPool's MuJoCo is older, and solves many contacts at once to other digits."""
+def tolerances(task: str, size: int, step: int) -> tuple[np.ndarray, float]:
+    """
+    Of each observed number and of the reward, in the given step of an episode.
+
+    EnvPool's MuJoCo is older, and solves many contacts at once to other digits, which soon make a difference.
+    """
     if task not in IN_THREE_DIMENSIONS:
-        return np.full(size, 1e-9)
-    return np.where(np.arange(size) < IN_THREE_DIMENSIONS[task], 1e-2, 0.2)
+        return np.full(size, 1e-9), 1e-9
+    of_states, of_forces, of_reward = (1e-4, 5e-3, 5e-5) if step == 0 else (1e-2, 3e-2, 1e-2)
+    return np.where(np.arange(size) < IN_THREE_DIMENSIONS[task], of_states, of_forces), of_reward
 
 
 @every_task
@@ -123,25 +128,42 @@ def test_transitions_are_gymnasium_s(task: str) -> None:
     twins = [Twin(task, limit) for _ in range(env.num_envs)]
     for twin, observation in zip(twins, env.reset(), strict=True):
         twin.begin(observation)
-    tolerance = tolerances(task, env.observation_space.shape[0])
-    rng, ends = np.random.default_rng(0), 0
+    rng, ends, lengths = np.random.default_rng(0), 0, [0] * env.num_envs
     for _ in range(steps):
         actions = random_actions(env, rng)
         observations, rewards, dones, infos = env.step(actions)
         for i, twin in enumerate(twins):
             expected, reward, terminated, truncated, info = twin.env.step(actions[i])
             found = infos[i]["terminal_observation"] if dones[i] else observations[i]
+            tolerance, of_reward = tolerances(task, len(found), lengths[i])
+            lengths[i] = 0 if dones[i] else lengths[i] + 1
             assert (np.abs(found - expected) <= tolerance * (1 + np.abs(expected))).all()
             # SB3's rewards have 32 bits
-            np.testing.assert_allclose(rewards[i], reward, rtol=1e-6, atol=max(1e-6, tolerance[0]))
+            np.testing.assert_allclose(rewards[i], reward, rtol=1e-6, atol=max(1e-6, of_reward))
             assert dones[i] == (terminated or truncated)
             assert infos[i]["TimeLimit.truncated"] == (truncated and not terminated)
             for name in info.keys() & infos[i].keys() - PLACES:
-                np.testing.assert_allclose(infos[i][name], info[name], rtol=1e-6, atol=tolerance[0], err_msg=name)
+                np.testing.assert_allclose(infos[i][name], info[name], rtol=1e-6, atol=of_reward, err_msg=name)
             if dones[i]:
                 twin.begin(observations[i])
                 ends += 1
     assert ends >= 2 * env.num_envs
+
+
+@every_task
+def test_starts_are_of_gymnasium_s_distribution(task: str) -> None:
+    n_starts = 150
+    env = EnvPoolVecEnv([lambda: gym.make(task)] * 10, 1)
+    env.seed(0)
+    found = np.concatenate([env.reset() for _ in range(n_starts // 10)])
+    twin = gym.make(task)
+    expected = np.stack([twin.reset(seed=seed)[0] for seed in range(n_starts)])
+    spread = expected.std(axis=0)
+    np.testing.assert_allclose(found.mean(axis=0), expected.mean(axis=0), atol=1e-9 + 6.0 * spread.max() / np.sqrt(n_starts))
+    moving = spread > 1e-6
+    ratio = found.std(axis=0)[moving] / spread[moving]
+    assert (np.abs(np.log(ratio)) < 0.4).all(), ratio
+    assert (found.std(axis=0)[~moving] < 1e-5).all()
 
 
 @every_task
@@ -273,10 +295,12 @@ def test_an_agent_trains_and_is_evaluated_on_it() -> None:
     assert np.isfinite(mean)
 
 
-def test_numbers_that_blow_up_cut_the_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("n_steps", [0, 1])
+def test_numbers_that_blow_up_cut_the_episode(n_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     env = pool("HalfCheetah-v5", 3, max_episode_steps=1000)
-    env.reset()
-    before, *_ = env.step(np.zeros((3, 6)))
+    before = env.reset()
+    for _ in range(n_steps):
+        before, *_ = env.step(np.zeros((3, 6)))
     results = env._pool.recv
 
     def with_nan(*args: Any, **kwargs: Any) -> Any:
@@ -293,7 +317,7 @@ def test_numbers_that_blow_up_cut_the_episode(monkeypatch: pytest.MonkeyPatch) -
     assert dones.tolist() == [False, True, False]
     assert infos[1]["numerical_failure"] is True
     assert infos[1]["TimeLimit.truncated"] is True
-    assert (infos[1]["reward_forward"], infos[1]["episode"]["l"], rewards[1]) == (0.0, 2, 0.0)
+    assert (infos[1]["reward_forward"], infos[1]["episode"]["l"], rewards[1]) == (0.0, n_steps + 1, 0.0)
     np.testing.assert_array_equal(infos[1]["terminal_observation"], before[1])
     assert np.isfinite(observations).all()
     assert env.numerical_failures == 1
@@ -331,6 +355,8 @@ def test_without_envpool_all_is_as_it_was(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_tasks_that_differ_are_refused() -> None:
+    different = [lambda: gym.make("Walker2d-v5"), lambda: gym.make("HalfCheetah-v5")]
+    assert type(batched_vec_env(different)) is DummyVecEnv
     with pytest.raises(ValueError, match="of one task, got HalfCheetah-v5, Walker2d-v5"):
         EnvPoolVecEnv([lambda: gym.make("HalfCheetah-v5"), lambda: gym.make("Walker2d-v5")])
 
@@ -353,6 +379,12 @@ def test_methods_that_would_need_the_state_are_refused(name: str) -> None:
     env.reset()
     with pytest.raises(NotImplementedError, match=f"'{name}'; use DummyVecEnv"):
         env.env_method(name)
+
+
+@pytest.mark.parametrize("name", ["data", "state_vector", "set_state"])
+def test_the_state_is_not_shown_where_it_stands_still(name: str) -> None:
+    with pytest.raises(NotImplementedError, match=f"'{name}'; use DummyVecEnv"):
+        pool("HalfCheetah-v5").get_attr(name)
 
 
 def test_there_are_no_pictures() -> None:

@@ -185,6 +185,7 @@ def test_what_was_measured_is_saved(tmp_path: Path) -> None:
     assert isinstance(expected, MeasuredLambda)
     np.testing.assert_array_equal(rule._sums, expected._sums)
     assert loaded.gae_lambda == 0.96
-    fixed = TRPOGAE.load(tmp_path / "model", env=vec_env(n_envs=4), gae_lambda=0.5)
-    train_once(fixed)
-    assert fixed.gae_lambda == 0.5
+    for how in ({"gae_lambda": 0.5}, {"custom_objects": {"gae_lambda": 0.5}}):
+        fixed = TRPOGAE.load(tmp_path / "model", env=vec_env(n_envs=4), **how)  # type: ignore[arg-type]
+        train_once(fixed)
+        assert fixed.gae_lambda == 0.5

@@ -22,6 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecEnv, V
 
 from sb3_gae import TRPOGAE, MujocoVecEnv
 from sb3_gae.envs import TASKS, MujocoTask, MujocoTaskEnv, PhysicsStates
+from sb3_gae.envs.cart_pole import GaeCartPoleEnv
 from sb3_gae.vec_env import StepInfos
 from sb3_gae.vec_env.choice import batched_vec_env
 from sb3_gae.vec_env.mujoco_vec_env import can_batch
@@ -164,9 +165,10 @@ PENDULUM = """
 class PendulumTask(MujocoTask):
     """What it returns are parts of the arrays that it gets."""
 
-    def __init__(self, model_path: Path, frame_skip: int = 1, push: float = 0.0):
+    def __init__(self, model_path: Path, frame_skip: int = 1, push: float = 0.0, goal: Any = None):
         super().__init__(model_path, frame_skip)
         self.push = push
+        self.goal = goal
 
     def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         return rng.uniform(-1.0, 1.0, 1), np.array([self.push])
@@ -341,6 +343,18 @@ def test_a_task_is_shared_so_that_changing_it_changes_every_environment() -> Non
     assert all(task is env.task for task in env.get_attr("task"))
     env.get_attr("task")[2].alive_bonus = 9.0
     assert [info["alive_bonus"] for info in env.step(np.zeros((3, 10)))[3]] == [9.0] * 3
+
+
+def test_a_model_is_shared_too() -> None:
+    trajectories = []
+    for changed in (0, 2):
+        env = MujocoVecEnv(functions("GaeBiped-v0", 3), 1)
+        env.get_attr("model", [changed])[0].opt.gravity[:] = 0.0
+        env.seed(0)
+        env.reset()
+        trajectories.append(np.stack([env.step(np.zeros((3, 10)))[0] for _ in range(5)]))
+    np.testing.assert_array_equal(*trajectories)
+    assert (np.abs(np.diff(trajectories[0][:, :, 19], axis=0)) < 1e-2).all(), "nothing falls"
 
 
 @pytest.mark.parametrize("wrapper", [Monitor, TimeLimit, ClipAction])
@@ -540,6 +554,27 @@ def test_blow_ups_are_counted_and_warned_of_once(pendulum: Path, tmp_path: Path,
     ]
 
 
+class SensingPendulumTask(PendulumTask):
+    def observations(self, states: PhysicsStates) -> np.ndarray:
+        return np.concatenate([states.sensors["angle"], states.qvel], axis=1)
+
+
+@pytest.mark.filterwarnings("ignore:The physics of an environment")
+@pytest.mark.parametrize("frame_skip", [1, 2, 3])
+@pytest.mark.parametrize("gear", [3e7, 3e10, 3e13])
+def test_a_blow_up_is_the_same_one_at_a_time(
+    pendulum: Path, frame_skip: int, gear: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where only an acceleration is too large for MuJoCo, after which a batch takes no more physics steps."""
+    monkeypatch.chdir(tmp_path)
+    pendulum.write_text(PENDULUM.replace('joint="hinge" ctrl', f'joint="hinge" gear="{gear}" ctrl'))
+    env_fns: EnvFns = [lambda: Monitor(TimeLimit(MujocoTaskEnv(SensingPendulumTask(pendulum, frame_skip)), 10))] * 3
+    batched, dummy = both(env_fns)
+    assert_same_trajectories(batched, dummy, n_steps=12)
+    if gear > 1e10 and frame_skip > 1:
+        assert batched.numerical_failures > 0
+
+
 # Refusals, and what to do instead
 
 
@@ -557,6 +592,63 @@ def test_a_wrapper_that_would_have_to_see_each_step_is_refused() -> None:
 def test_environments_that_differ_are_refused(other: tuple[str, dict[str, float]]) -> None:
     with pytest.raises(ValueError, match="one task with the same arguments"):
         MujocoVecEnv([lambda: gym.make("GaeBiped-v0"), lambda: gym.make(other[0], **other[1])])
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ((1.0,), (2.0,)),
+        ([1.0, 2.0], [1.0]),
+        (np.array([1.0]), np.array([2.0])),
+        (np.float32(1.0), np.float32(2.0)),
+        ({"a": 1}, {"a": 2}),
+        ({"a": 1}, {"b": 1}),
+        (1, 1.5),
+        (None, 0),
+    ],
+)
+def test_settings_of_any_kind_are_compared(pendulum: Path, one: Any, other: Any) -> None:
+    same = [lambda: MujocoTaskEnv(PendulumTask(pendulum, goal=one))] * 2
+    MujocoVecEnv(same)
+    different = [*same, lambda: MujocoTaskEnv(PendulumTask(pendulum, goal=other))]
+    with pytest.raises(ValueError, match="one task with the same arguments"):
+        MujocoVecEnv(different)
+    assert type(batched_vec_env(same)) is MujocoVecEnv
+    assert type(batched_vec_env(different)) is DummyVecEnv
+
+
+class MoreReward(GaeCartPoleEnv):
+    def step(self, action: Any) -> Any:
+        observation, reward, *others = super().step(action)
+        return observation, reward + 100.0, *others
+
+
+class GenerousMonitor(Monitor):
+    def step(self, action: Any) -> Any:
+        observation, reward, *others = super().step(action)
+        return observation, reward + 100.0, *others
+
+
+class NamedMonitor(Monitor):
+    """With steps of its base."""
+
+
+@pytest.mark.parametrize(
+    ("make", "batched"),
+    [
+        (MoreReward, False),
+        (lambda: GenerousMonitor(gym.make("GaeCartPole-v0")), False),
+        (lambda: NamedMonitor(gym.make("GaeCartPole-v0")), True),
+    ],
+)
+def test_steps_of_one_s_own_are_not_passed_by(make: Callable[[], gym.Env], batched: bool) -> None:
+    env = batched_vec_env([make] * 2)
+    assert type(env) is (MujocoVecEnv if batched else DummyVecEnv)
+    env.reset()
+    assert env.step(np.zeros(2, dtype=int))[1].tolist() == [1.0 if batched else 101.0] * 2
+    if not batched:
+        with pytest.raises(ValueError, match="use DummyVecEnv"):
+            MujocoVecEnv([make])
 
 
 def test_models_that_differ_are_refused(pendulum: Path) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from sb3_gae.envs.mujoco_env import MujocoTaskEnv
 from sb3_gae.envs.mujoco_task import MujocoTask, PhysicsStates
 
-FEET = ("right_foot_force", "left_foot_force")
+LEGS = ("right_leg_force", "left_leg_force")
 
 
 def impact_cost(states: PhysicsStates, sensors: tuple[str, ...], largest: float) -> np.ndarray:
@@ -55,7 +55,7 @@ class Biped(MujocoTask):
         return {
             "forward_velocity": states.sensors["torso_velocity"][:, 0],
             "torque_cost": -self.torque_cost_weight * np.square(torques).sum(axis=1),
-            "impact_cost": -self.impact_cost_weight * impact_cost(states, FEET, self.largest_impact_force),
+            "impact_cost": -self.impact_cost_weight * impact_cost(states, LEGS, self.largest_impact_force),
             "alive_bonus": np.full(len(torques), self.alive_bonus),
         }
 

@@ -46,6 +46,14 @@ class MujocoTaskEnv(gym.Env):
         self._physics = np.zeros((1, mujoco.mj_stateSize(self.model, FULL_PHYSICS)))
         self._was_reset = False
 
+    def share_task(self, task: MujocoTask) -> None:
+        """
+        Take part in a batch, whose environments have one model.
+
+        :param task: equal to this environment's own
+        """
+        self.task, self.model, self.data = task, task.model, mujoco.MjData(task.model)
+
     @property
     def dt(self) -> float:
         """Seconds in a step."""
@@ -81,7 +89,11 @@ class MujocoTaskEnv(gym.Env):
 
     def _advance(self) -> bool:
         """Take the physics steps of one control step and return whether every one of them gave sound numbers."""
-        for _ in range(self.task.frame_skip):
+        self.data.warning.number[:] = 0
+        for step in range(self.task.frame_skip):
+            # The native call of a batch, too, goes no further after a warning
+            if step > 0 and self.data.warning.number.any():
+                return False
             mujoco.mj_step(self.model, self.data)
             if not is_physical(self.physics_state)[0]:
                 return False

@@ -111,7 +111,7 @@ class MujocoTask:
 
     def observations(self, states: PhysicsStates) -> np.ndarray:
         """
-        :param states: N states; after a reset there are no sensor readings yet, so only positions and velocities count
+        :param states: N states; at the beginning of an episode the sensors are read anew for the state itself
         :return: shape (N, n)
         """
         return np.concatenate([states.qpos, states.qvel], axis=1)

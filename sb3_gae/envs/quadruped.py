@@ -9,7 +9,7 @@ from sb3_gae.envs.biped import impact_cost
 from sb3_gae.envs.mujoco_env import MujocoTaskEnv
 from sb3_gae.envs.mujoco_task import MujocoTask, PhysicsStates
 
-FEET = ("front_left_force", "back_left_force", "back_right_force", "front_right_force")
+LEGS = ("front_left_leg_force", "back_left_leg_force", "back_right_leg_force", "front_right_leg_force")
 
 
 class Quadruped(MujocoTask):
@@ -46,7 +46,7 @@ class Quadruped(MujocoTask):
         return {
             "forward_velocity": states.sensors["torso_velocity"][:, 0],
             "torque_cost": -self.torque_cost_weight * np.square(torques).sum(axis=1),
-            "impact_cost": -self.impact_cost_weight * impact_cost(states, FEET, self.largest_impact_force),
+            "impact_cost": -self.impact_cost_weight * impact_cost(states, LEGS, self.largest_impact_force),
             "alive_bonus": np.full(len(torques), self.alive_bonus),
         }
 

@@ -7,7 +7,7 @@ import gymnasium as gym
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_gae.vec_env.envpool_vec_env import EnvPoolVecEnv, can_pool
-from sb3_gae.vec_env.mujoco_vec_env import MujocoVecEnv, can_batch
+from sb3_gae.vec_env.mujoco_vec_env import MujocoVecEnv, can_batch, have_common_task
 
 
 def batched_vec_env(env_fns: Sequence[Callable[[], gym.Env]], n_threads: int | None = None, **kwargs: Any) -> VecEnv:
@@ -21,8 +21,8 @@ def batched_vec_env(env_fns: Sequence[Callable[[], gym.Env]], n_threads: int | N
     """
     envs = [make() for make in env_fns]
     vec_env_class: Callable[..., VecEnv] = DummyVecEnv
-    if all(can_batch(env) for env in envs):
+    if all(can_batch(env) for env in envs) and have_common_task(envs):
         vec_env_class, kwargs = MujocoVecEnv, kwargs | {"n_threads": n_threads}
-    elif all(can_pool(env) for env in envs):
+    elif all(can_pool(env) for env in envs) and len({env.spec.id for env in envs if env.spec}) == 1:
         vec_env_class, kwargs = EnvPoolVecEnv, kwargs | {"n_threads": n_threads}
     return vec_env_class([lambda env=env: env for env in envs], **kwargs)

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Callable, Sequence
 from types import ModuleType
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium as gym
 import numpy as np
@@ -30,6 +30,9 @@ _NO_INFO = ("env_id", "players", "elapsed_step")
 
 # Arguments of gymnasium's environments that do not touch a trajectory
 _OF_PICTURES = ("render_mode", "width", "height", "camera_id", "camera_name", "default_camera_config", "max_geom")
+
+# What of a gymnasium environment shows or moves its state, which here never moves
+_OF_THE_STATE = ("data", "state_vector", "set_state", "do_simulation", "reset_model", "step", "reset")
 
 # EnvPool's own time limit, which we have no use for: it cannot tell a limit from an end that comes in the same step
 _NEVER = np.iinfo(np.int32).max
@@ -105,6 +108,7 @@ class EnvPoolVecEnv(BatchedVecEnv):
         columns = self._columns(info)
         for row, env in enumerate(indices.tolist()):
             self.reset_infos[env] = {name: column[row].item() for name, column in columns.items()}
+        self._last_observations[indices] = observations
         return observations
 
     def _seed_pool(self, seeds: Sequence[int | None]) -> None:
@@ -130,6 +134,11 @@ class EnvPoolVecEnv(BatchedVecEnv):
         warnings.warn("EnvPoolVecEnv has no pictures; use DummyVecEnv for them.", stacklevel=2)
         return [None] * self.num_envs
 
+    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        if attr_name in _OF_THE_STATE:
+            self._refuse(attr_name)
+        return super().get_attr(attr_name, indices)
+
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         for env in self._get_indices(indices):
             setattr(self.envs[env], attr_name, value)
@@ -138,11 +147,14 @@ class EnvPoolVecEnv(BatchedVecEnv):
         chosen = list(self._get_indices(indices))
         monitors = [self._monitors[env] for env in chosen]
         if hasattr(gym.Wrapper, method_name) or not all(hasattr(monitor, method_name) for monitor in monitors):
-            raise NotImplementedError(
-                f"EnvPool keeps the state of these environments to itself, so there is no one to ask for {method_name!r}; "
-                "use DummyVecEnv."
-            )
+            self._refuse(method_name)
         return [getattr(monitor, method_name)(*args, **kwargs) for monitor in monitors]
+
+    @staticmethod
+    def _refuse(name: str) -> NoReturn:
+        raise NotImplementedError(
+            f"EnvPool keeps the state of these environments to itself, so nobody can be asked for {name!r}; use DummyVecEnv."
+        )
 
 
 def can_pool(env: gym.Env) -> bool:

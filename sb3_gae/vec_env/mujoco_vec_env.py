@@ -26,9 +26,9 @@ class MujocoVecEnv(BatchedVecEnv):
 
     The environments that the functions make are kept: each draws its own initial states, and attributes, methods
     and pictures are asked of them, with the present state handed to them first. Between resets they are not stepped.
-    They share the first one's ``task``, so that whoever changes it changes it for all of them.
+    They share the first one's ``task`` and ``model``, so that whoever changes them changes them for all.
 
-    :param env_fns: each makes an environment whose innermost is a :class:`~sb3_gae.envs.MujocoTaskEnv`
+    :param env_fns: each makes an environment whose innermost is a :class:`~sb3_gae.envs.MujocoTaskEnv` with its own ``step``
     :param n_threads: that step the physics; None for as many as there are cores
     :raises ValueError: if there is no environment or one of them comes twice, is of another kind, has a wrapper that
         would have to see each step, or differs from the first; or if ``n_threads`` is less than 1
@@ -37,11 +37,13 @@ class MujocoVecEnv(BatchedVecEnv):
     def __init__(self, env_fns: Sequence[Callable[[], gym.Env]], n_threads: int | None = None):
         envs = make_envs(env_fns)
         self._bases = [_base_of(env) for env in envs]
-        self.task = _common_task(self._bases)
+        if not have_common_task(envs):
+            raise ValueError("All environments of a MujocoVecEnv must be of one task with the same arguments.")
+        self.task = self._bases[0].task
         model = self.task.model
         super().__init__(envs, self.task.observation_space, self.task.action_space, n_threads)
-        for base in self._bases:
-            base.task = self.task
+        for base in self._bases[1:]:
+            base.share_task(self.task)
         self._pool = Rollout(nthread=self.n_threads if self.n_threads > 1 else 0)
         self._models, self._datas = [model] * self.num_envs, [mujoco.MjData(model) for _ in range(self.n_threads)]
         n_state, frame_skip = self._bases[0].physics_state.shape[1], self.task.frame_skip
@@ -64,13 +66,10 @@ class MujocoVecEnv(BatchedVecEnv):
             state=self._new_physics,
             sensordata=self._sensor_data,
         )
-        # Not the last one alone: numbers that blew up in the middle may have been cut to something finite
-        sound = is_physical(self._new_physics.reshape(self.num_envs, -1))
-        failed = None if sound.all() else ~sound
+        failed = self._failures()
         states = self.task.states(self._new_physics[:, -1], self._controls[:, -1], self._sensor_data[:, -1])
         if failed is not None:
-            self._new_physics[failed, -1] = self._physics[failed]
-            self._sensor_data[failed] = 0.0
+            self._go_back(failed)
         self._physics[:] = self._new_physics[:, -1]
         # Copies: what a task returns may be a part of arrays that the next step writes to
         terms = {name: np.array(term, dtype=np.float64) for name, term in self.task.reward_terms(states).items()}
@@ -82,6 +81,23 @@ class MujocoVecEnv(BatchedVecEnv):
                 term[failed] = 0.0
         rewards = np.asarray(total_reward(terms), dtype=np.float64)
         return self._finish_step(observations, rewards, terminated, failed, terms)
+
+    def _failures(self) -> np.ndarray | None:
+        """Whether each environment's numbers blew up in this step, shape (N,); None if they did nowhere."""
+        # Not in the last physics step alone: numbers that blew up before it may have been cut to something finite
+        sound = is_physical(self._new_physics.reshape(self.num_envs, -1))
+        # After a warning of MuJoCo the native call takes no more physics steps, and time stands still
+        sound &= (np.diff(self._new_physics[:, :, 0], axis=1) > 0.0).all(axis=1)
+        return None if sound.all() else ~sound
+
+    def _go_back(self, failed: np.ndarray) -> None:
+        """To the state before the step, with what the sensors say of it."""
+        self._new_physics[failed, -1] = self._physics[failed]
+        for env in np.flatnonzero(failed).tolist():
+            base = self._bases[env]
+            base.data.ctrl[:] = self._controls[env, -1]
+            base.physics_state = self._physics[env]
+            self._sensor_data[env, -1] = base.data.sensordata
 
     def _restart_envs(self, indices: np.ndarray, seeds: Sequence[int | None], options: Sequence[dict[str, Any]]) -> np.ndarray:
         observations = []
@@ -134,26 +150,56 @@ def can_batch(env: gym.Env) -> bool:
     :param env: an environment in its wrappers
     :return: whether :class:`MujocoVecEnv` can step it
     """
-    return isinstance(env.unwrapped, MujocoTaskEnv) and foreign_wrapper(env) is None
+    return _steps_a_task(env.unwrapped) and foreign_wrapper(env) is None
+
+
+def have_common_task(envs: Sequence[gym.Env]) -> bool:
+    """
+    :param envs: each of which :class:`MujocoVecEnv` can step
+    :return: whether they are of one task with the same model and the same settings
+    """
+    first, *others = (cast(MujocoTaskEnv, env.unwrapped).task for env in envs)
+    model = _serialized(first)
+    return all(
+        type(task) is type(first) and _are_equal(_settings_of(task), _settings_of(first)) and _serialized(task) == model
+        for task in others
+    )
+
+
+def _steps_a_task(base: gym.Env) -> bool:
+    """A subclass with steps of its own would not be asked for them."""
+    return isinstance(base, MujocoTaskEnv) and type(base).step is MujocoTaskEnv.step
 
 
 def _base_of(env: gym.Env) -> MujocoTaskEnv:
     base = env.unwrapped
     if not isinstance(base, MujocoTaskEnv):
         raise ValueError(f"MujocoVecEnv steps environments of a MujocoTask, got {base}; use DummyVecEnv for it.")
+    if not _steps_a_task(base):
+        raise ValueError(
+            f"MujocoVecEnv would pass by the `step` of {type(base).__name__}; say it in the functions of its MujocoTask, "
+            "or use DummyVecEnv."
+        )
     return base
 
 
-def _common_task(bases: Sequence[MujocoTaskEnv]) -> MujocoTask:
-    expected = _settings_of(bases[0].task)
-    if any(_settings_of(base.task) != expected for base in bases[1:]):
-        raise ValueError("All environments of a MujocoVecEnv must be of one task with the same arguments.")
-    return bases[0].task
-
-
 def _settings_of(task: MujocoTask) -> dict[str, Any]:
-    """The class, the model and the plain settings of a task, to be compared."""
-    plain = {name: value for name, value in vars(task).items() if isinstance(value, int | float | str | bool)}
+    return {name: value for name, value in vars(task).items() if name not in ("model", "_initial_data")}
+
+
+def _serialized(task: MujocoTask) -> bytes:
     model = np.empty(mujoco.mj_sizeModel(task.model), dtype=np.uint8)
     mujoco.mj_saveModel(task.model, None, model)
-    return plain | {"class": type(task), "model": model.tobytes()}
+    return model.tobytes()
+
+
+def _are_equal(one: Any, other: Any) -> bool:
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, np.ndarray):
+        return bool(np.array_equal(one, other))
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(_are_equal(one[key], other[key]) for key in one)
+    if isinstance(one, list | tuple):
+        return len(one) == len(other) and all(map(_are_equal, one, other))
+    return bool(one == other)
