@@ -11,9 +11,11 @@ environments in a DummyVecEnv: it is run with several numbers of them, and its f
 """
 
 import argparse
+import functools
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
@@ -30,6 +32,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_gae import TRPOGAE, MujocoVecEnv
+from sb3_gae.collection import ActionSampler
 from sb3_gae.presets import LOCOMOTION_NETWORKS
 from sb3_gae.vec_env.choice import batched_vec_env
 
@@ -57,7 +60,7 @@ class Task(NamedTuple):
 
 TASKS = (
     Task("GaeBiped-v0", 256, 10.0, 0.25, True),
-    Task("HalfCheetah-v5", 64, 4.0, 0.6, False),
+    Task("HalfCheetah-v5", 256, 4.0, 0.6, False),
     Task("Humanoid-v5", 64, 1.5, 0.8, False),
 )
 
@@ -73,6 +76,7 @@ class Meter:
             setattr(owner, name, self._timed(getattr(owner, name)))
 
     def _timed(self, call: Callable) -> Callable:
+        @functools.wraps(call)
         def timed(*args: Any, **kwargs: Any) -> Any:
             start = time.perf_counter()
             try:
@@ -174,7 +178,8 @@ def compare(task: Task, rounds: int) -> bool:
     physics, policy = Meter(), Meter()
     owner, names = physics_of(ours.model.env)
     physics.watch(owner, *names)
-    policy.watch(ours.model.policy, "_predict", "evaluate_actions", "predict_values")
+    policy.watch(ActionSampler, "__call__")
+    policy.watch(ours.model.policy, "evaluate_actions", "predict_values")
     limits, shares = [], []
     for _ in range(rounds + 1):
         limits.append(limit())
@@ -254,6 +259,8 @@ def main() -> None:
     if args.memory_here:
         memory_here()
         return
+    # sb3-contrib's, of a last minibatch that is smaller
+    warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
     print(f"Python {sys.version.split()[0]}, torch {th.__version__}, {th.get_num_threads()} threads")
     met = [] if args.memory else [compare(task, args.rounds) for task in TASKS if task.env in args.tasks]
     met.append(memory())

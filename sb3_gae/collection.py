@@ -11,6 +11,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from sb3_gae.advantages import discounted_returns
 from sb3_gae.batch import TrainingBatch, as_float, in_chunks
 from sb3_gae.checks import check_finite_rollout, check_finite_step
+from sb3_gae.dense_policy import gaussian_layers
 from sb3_gae.errors import NumericalError
 from sb3_gae.rollout_buffer import GAERolloutBuffer
 
@@ -43,23 +44,45 @@ class RolloutEnd(NamedTuple):
     dones: np.ndarray
 
 
-def sample_actions(policy: ActorCriticPolicy, observations: Observations, step: int) -> np.ndarray:
+class ActionSampler:
     """
+    Draws the actions of the steps of one rollout.
+
+    A Gaussian MLP is asked for its layers, which draws the same actions as the policy itself without making and checking a
+    distribution in each step.
+
     :param policy: in evaluation mode
-    :param observations: finite, shape (N, ...), or a dictionary of such
-    :param step: of the rollout, for messages
-    :return: actions as the distribution gives them, in the shape of the action space, (N, ...)
-    :raises NumericalError: if an action, or a parameter of the distribution, is not finite
     """
-    try:
-        with th.no_grad():
-            actions = policy._predict(obs_as_tensor(observations, policy.device)).cpu().numpy()
-        actions = actions.reshape(-1, *policy.action_space.shape)  # type: ignore[misc]
-    except ValueError as error:
-        # So torch refuses the parameters of a distribution
-        raise NumericalError(f"The action distribution is invalid at step {step} of the rollout: {error}") from error
-    check_finite_step("action", actions, step)
-    return actions
+
+    def __init__(self, policy: ActorCriticPolicy):
+        self._policy = policy
+        self._layers = gaussian_layers(policy)
+        self._std = policy.log_std.detach().exp() if self._layers else None
+
+    def __call__(self, observations: Observations, step: int) -> np.ndarray:
+        """
+        :param observations: finite, shape (N, ...), or a dictionary of such
+        :param step: of the rollout, for messages
+        :return: actions as the distribution gives them, in the shape of the action space, (N, ...)
+        :raises NumericalError: if an action, or a parameter of the distribution, is not finite
+        """
+        try:
+            with th.no_grad():
+                actions = self._draw(obs_as_tensor(observations, self._policy.device)).cpu().numpy()
+            actions = actions.reshape(-1, *self._policy.action_space.shape)  # type: ignore[misc]
+        except ValueError as error:
+            # So torch refuses the parameters of a distribution
+            raise NumericalError(f"The action distribution is invalid at step {step} of the rollout: {error}") from error
+        check_finite_step("action", actions, step)
+        return actions
+
+    def _draw(self, observations: Any) -> th.Tensor:
+        if self._std is None:
+            return self._policy._predict(observations)
+        mean = observations.float()
+        for layer in self._layers:
+            mean = layer(mean)
+        return mean + th.normal(th.zeros_like(mean), th.ones_like(mean)) * self._std
 
 
 def environment_actions(policy: ActorCriticPolicy, actions: np.ndarray) -> np.ndarray:

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BaseModel
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, MlpExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
@@ -36,6 +37,22 @@ def has_dense_value(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor]) 
     :return: whether that is exactly an MLP as SB3 builds it, on features that the step does not move
     """
     return _inherits(policy, "predict_values", "extract_features") and _hold_exactly(_value_layers(policy), [], parameters)
+
+
+def gaussian_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
+    """
+    :param policy: any actor-critic policy
+    :return: the layers from vector observations to the mean of the actions, if the policy is a Gaussian one as SB3 builds it;
+        nothing for others
+    """
+    as_sb3 = (
+        _inherits(policy, "_predict", "get_distribution", "extract_features", "_get_action_dist_from_latent")
+        and type(policy.action_dist) is DiagGaussianDistribution
+        and type(policy.pi_features_extractor) is FlattenExtractor
+        and isinstance(policy.observation_space, spaces.Box)
+        and len(policy.observation_space.shape) == 1
+    )
+    return _policy_layers(policy) if as_sb3 else []
 
 
 def dense_policy_network(policy: ActorCriticPolicy, observations: PyTorchObs) -> DenseNetwork:

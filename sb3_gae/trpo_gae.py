@@ -21,13 +21,13 @@ from sb3_gae.all_or_nothing import all_or_nothing
 from sb3_gae.batch import TrainingBatch, random_subset, standardized
 from sb3_gae.checks import check_finite_parameters, check_finite_rollout, check_finite_step
 from sb3_gae.collection import (
+    ActionSampler,
     Observations,
     RolloutEnd,
     TerminalObservation,
     environment_actions,
     evaluate_rollout,
     reward_returns,
-    sample_actions,
     terminal_observations,
     training_batch,
 )
@@ -38,6 +38,7 @@ from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_gae.policy_step import policy_parameters, policy_step
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
 from sb3_gae.saved_model import SavedModel
+from sb3_gae.threads import threads_for_steps
 from sb3_gae.time_baseline import TimeBaseline
 from sb3_gae.trust_region import StepRecord, TrustRegionSettings
 from sb3_gae.update_summary import update_summary
@@ -248,37 +249,13 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         check_finite_step("observation", self._last_obs, 0)
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
-        terminal: list[TerminalObservation] = []
-        n_steps = 0
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
         callback.on_rollout_start()
-
-        while n_steps < n_rollout_steps and not quota.is_met:
-            if self.use_sde and self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0:
-                self.policy.reset_noise(env.num_envs)
-            actions = sample_actions(self.policy, self._last_obs, n_steps)
-            clipped_actions = environment_actions(self.policy, actions)
-            new_obs, rewards, dones, infos = env.step(clipped_actions)
-            check_finite_step("reward", rewards, n_steps)
-            check_finite_step("observation", cast(Observations, new_obs), n_steps + 1)
-
-            self.num_timesteps += env.num_envs
-            callback.update_locals(locals())
-            if not callback.on_step():
-                return False
-
-            counts = quota.counts
-            truncated = np.zeros(env.num_envs, dtype=bool)
-            if dones.any():
-                endings = self._record_endings(n_steps, dones, dones if counts is None else dones & counts, infos)
-                terminal.extend(endings)
-                truncated[[ending.env for ending in endings]] = True
-            rollout_buffer.add_step(self._last_obs, actions, rewards, self._last_episode_starts, dones, truncated, counts)
-            quota.add(dones)
-            n_steps += 1
-            self._last_obs = cast(Observations, new_obs)
-            self._last_episode_starts = dones
+        with threads_for_steps(self.policy, env.num_envs):
+            terminal = self._collect_steps(env, callback, rollout_buffer, n_rollout_steps, quota)
+        if terminal is None:
+            return False
 
         if self.n_episodes is not None:
             self._finish_episodes(rollout_buffer, quota)
@@ -291,6 +268,48 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
+
+    def _collect_steps(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: GAERolloutBuffer,
+        n_rollout_steps: int,
+        quota: EpisodeQuota,
+    ) -> list[TerminalObservation] | None:
+        """Take the steps of a rollout, and return where time limits struck; nothing if the callback ended training."""
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        sample = ActionSampler(self.policy)
+        terminal: list[TerminalObservation] = []
+        n_steps = 0
+        while n_steps < n_rollout_steps and not quota.is_met:
+            if self.use_sde and self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0:
+                self.policy.reset_noise(env.num_envs)
+            actions = sample(self._last_obs, n_steps)
+            clipped_actions = environment_actions(self.policy, actions)
+            new_obs, rewards, dones, infos = env.step(clipped_actions)
+            check_finite_step("reward", rewards, n_steps)
+            check_finite_step("observation", cast(Observations, new_obs), n_steps + 1)
+
+            self.num_timesteps += env.num_envs
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return None
+
+            counts = quota.counts
+            truncated = np.zeros(env.num_envs, dtype=bool)
+            if dones.any():
+                endings = self._record_endings(n_steps, dones, dones if counts is None else dones & counts, infos)
+                terminal.extend(endings)
+                truncated[[ending.env for ending in endings]] = True
+            rollout_buffer.add_step(self._last_obs, actions, rewards, self._last_episode_starts, dones, truncated, counts)
+            quota.add(dones)
+            n_steps += 1
+            self._last_obs = cast(Observations, new_obs)
+            self._last_episode_starts = dones
+        # For the end of the rollout, when the number of steps is one more
+        callback.update_locals(locals())
+        return terminal
 
     def _record_endings(
         self, step: int, dones: np.ndarray, counted: np.ndarray, infos: list[dict[str, Any]]
