@@ -163,7 +163,7 @@ def test_the_policy_step_leaves_the_value_function_alone_unless_they_share_layer
 ) -> None:
     model = model_with(policy)
     monkeypatch.setattr(TRPOGAE, "_fit_value", lambda self, batch, parameters: None)
-    monkeypatch.setattr(TRPOGAE, "_log_update", lambda self, policy_record, value_record: None)
+    monkeypatch.setattr(TRPOGAE, "_log_update", lambda self, policy_record, value_record, value_targets: None)
     train_once(model)
     samples = model.rollout_buffer.batch()
     with th.no_grad():
