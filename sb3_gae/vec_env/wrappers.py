@@ -30,8 +30,9 @@ def foreign_wrapper(env: gym.Env) -> gym.Wrapper | None:
 
 
 def _is_known(wrapper: gym.Wrapper) -> bool:
-    """A subclass is, too, as long as it leaves the steps alone."""
-    return any(isinstance(wrapper, known) and type(wrapper).step is known.step for known in _KNOWN_WRAPPERS)
+    """A subclass is, too, as long as it leaves the steps alone, or is what rl-zoo3 puts in the place of ``TimeLimit``."""
+    steps_as_known = any(isinstance(wrapper, known) and type(wrapper).step is known.step for known in _KNOWN_WRAPPERS)
+    return steps_as_known or (isinstance(wrapper, TimeLimit) and type(wrapper).__module__ == "rl_zoo3.gym_patches")
 
 
 def refuse_foreign_wrapper(env: gym.Env) -> None:
