@@ -147,6 +147,10 @@ class BatchedVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return [self.envs[env].get_wrapper_attr(attr_name) for env in self._get_indices(indices)]
 
+    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
+        for env in self._get_indices(indices):
+            setattr(self.envs[env], attr_name, value)
+
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         from stable_baselines3.common.env_util import is_wrapped  # a cycle at the top: env_util imports vec_env
 

@@ -139,10 +139,6 @@ class EnvPoolVecEnv(BatchedVecEnv):
             self._refuse(attr_name)
         return super().get_attr(attr_name, indices)
 
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        for env in self._get_indices(indices):
-            setattr(self.envs[env], attr_name, value)
-
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
         chosen = list(self._get_indices(indices))
         monitors = [self._monitors[env] for env in chosen]
