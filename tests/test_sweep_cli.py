@@ -36,6 +36,9 @@ def test_from_a_dry_run_to_figures(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["figure", "lambda", "--from", "results.csv"]) == 0
     assert main(["figure", "curves", "--name", "s", "-o", "figures/curves.svg"]) == 0
     assert Path("logs/sweeps/results_lambda.png").exists() and Path("figures/curves.svg").exists()
+    capsys.readouterr()
+    assert main(["rank", "--from", "results.csv", "--lambdas", "1", "--by", "last"]) == 0
+    assert "| value function by trust region | 0.9 | 1 | 2 |" in capsys.readouterr().out
 
 
 def test_cells_that_fail_are_told(capsys: pytest.CaptureFixture[str]) -> None:

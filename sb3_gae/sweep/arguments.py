@@ -8,6 +8,7 @@ from rl_zoo3.utils import StoreDict
 from sb3_gae.sweep.conditions import CONDITIONS
 from sb3_gae.sweep.figures import KINDS
 from sb3_gae.sweep.presets import PRESETS
+from sb3_gae.sweep.series import RANKED_BY
 
 _EXAMPLES = """examples:
   python -m sb3_gae.sweep run --preset small --jobs 2
@@ -36,6 +37,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_study(exported)
     exported.add_argument("-o", "--output", nargs="+", help="files (default: logs/sweeps/NAME.csv and .parquet)")
     _add_figure(commands.add_parser("figure", help="draw a figure from stored results"))
+    _add_rank(commands.add_parser("rank", help="a table of the curves, the best first, with intervals"))
     return parser
 
 
@@ -71,10 +73,26 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
 
 def _add_figure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kind", choices=KINDS)
-    _add_study(parser)
-    parser.add_argument("--from", dest="source", metavar="FILE", help="an exported file, in place of a storage")
+    _add_selection(parser)
     parser.add_argument("-o", "--output", help="PNG or SVG file; without an ending both (default: logs/sweeps/NAME_KIND)")
     parser.add_argument("--iteration", type=int, help="whose returns heatmap and lambda show (default: the last)")
+
+
+def _add_rank(parser: argparse.ArgumentParser) -> None:
+    _add_selection(parser)
+    parser.add_argument(
+        "--by",
+        choices=RANKED_BY,
+        default="training",
+        help="the mean return over training (area under the learning curve), or the last one (default: training)",
+    )
+    parser.add_argument("--iteration", type=int, help="where training counts as ended (default: the last)")
+
+
+def _add_selection(parser: argparse.ArgumentParser) -> None:
+    """Results and which of them; :func:`selection_of` reads the latter."""
+    _add_study(parser)
+    parser.add_argument("--from", dest="source", metavar="FILE", help="an exported file, in place of a storage")
     parser.add_argument("--env", nargs="+", help="only these tasks")
     parser.add_argument("--conditions", nargs="+", help="only these")
     parser.add_argument("--gammas", nargs="+", type=float, help="only these")
@@ -84,7 +102,7 @@ def _add_figure(parser: argparse.ArgumentParser) -> None:
 
 def selection_of(args: argparse.Namespace) -> dict[str, Any]:
     """
-    :param args: of the command ``figure``
+    :param args: of the commands ``figure`` and ``rank``
     :return: arguments of :func:`~sb3_gae.sweep.results.select`
     """
     return {

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import pandas as pd
+
 from sb3_gae.sweep.arguments import make_parser, selection_of
 from sb3_gae.sweep.cost import estimate_cost
 from sb3_gae.sweep.errors import SweepError
@@ -14,7 +16,7 @@ from sb3_gae.sweep.figures import draw
 from sb3_gae.sweep.ledger import Status
 from sb3_gae.sweep.plan import Options, Plan, default_name, make_cells
 from sb3_gae.sweep.report import failures, overview, running
-from sb3_gae.sweep.results import NO_PARQUET, read_results, results_of
+from sb3_gae.sweep.results import NO_PARQUET, read_results, results_of, select
 from sb3_gae.sweep.runner import check_plan, run_plan, standings_of
 from sb3_gae.sweep.storage import holds
 from sb3_gae.sweep.study import SweepStudy, default_location
@@ -30,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     args = make_parser().parse_args(arguments)
     try:
-        return {"run": _run, "status": _status, "export": _export, "figure": _figure}[args.command](args)
+        return {"run": _run, "status": _status, "export": _export, "figure": _figure, "rank": _rank}[args.command](args)
     except SweepError as error:
         print(f"sb3_gae.sweep: {error}", file=sys.stderr)
         return _BAD_INPUT
@@ -119,16 +121,30 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _figure(args: argparse.Namespace) -> int:
-    if args.source is not None:
-        if args.storage is not None or args.name is not None or args.preset is not None:
-            raise SweepError("`from` names a file; leave out --storage, --name and --preset, or --from.")
-        table, name = read_results(args.source), Path(args.source).name.split(".")[0]
-    else:
-        study = _study_of(args)
-        table, name = results_of(study), study.name
+    table, name = _results_of(args)
     for path in draw(args.kind, table, args.output or f"logs/sweeps/{name}_{args.kind}", args.iteration, **selection_of(args)):
         print(f"wrote {path}")
     return 0
+
+
+def _rank(args: argparse.Namespace) -> int:
+    table, _ = _results_of(args)
+    chosen = select(table, **selection_of(args))
+    # Every process of a sweep would wait for rliable
+    from sb3_gae.sweep.ranking import as_markdown, rank_curves
+
+    print(as_markdown(rank_curves(chosen, args.iteration, args.by)))
+    return 0
+
+
+def _results_of(args: argparse.Namespace) -> tuple[pd.DataFrame, str]:
+    """The table that a command names, and a name for files that are made of it."""
+    if args.source is not None:
+        if args.storage is not None or args.name is not None or args.preset is not None:
+            raise SweepError("`from` names a file; leave out --storage, --name and --preset, or --from.")
+        return read_results(args.source), Path(args.source).name.split(".")[0]
+    study = _study_of(args)
+    return results_of(study), study.name
 
 
 def _study_of(args: argparse.Namespace) -> SweepStudy:

@@ -10,6 +10,9 @@ from sb3_gae.sweep.conditions import CONDITIONS
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Curve
 
+#: what curves are put in order by: the mean return over training or that at its end
+RANKED_BY = ("training", "last")
+
 
 class Series(NamedTuple):
     """

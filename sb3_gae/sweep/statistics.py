@@ -64,6 +64,24 @@ def estimate_each(samples: Sequence[np.ndarray]) -> list[Estimate]:
     return [result for result in results if result is not None]
 
 
+def difference(better: np.ndarray, other: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
+    """
+    :param better: scores of one set of runs, shape (runs,)
+    :param other: of another; the numbers of runs may differ
+    :param resamples: of the bootstrap, which draws both sets independently
+    :return: by how much the interquartile mean of the first is larger, with arrays of shape (1,)
+    """
+    with _fixed_random_numbers():
+        points, intervals = library.get_interval_estimates(
+            {"": (better[:, None], other[:, None])},  # runs, tasks
+            lambda first, second: interquartile_mean(first) - interquartile_mean(second),
+            reps=resamples,
+            confidence_interval_size=CONFIDENCE,
+        )
+    low, high = intervals[""]
+    return Estimate(points[""], low, high)
+
+
 @contextlib.contextmanager
 def _fixed_random_numbers() -> Iterator[None]:
     """rliable draws from NumPy's global generator, whatever it is given."""

@@ -58,8 +58,16 @@ def best(curve: Curve, result: Estimate) -> str:
     :param result: at one point
     :return: which it is, its interquartile mean and interval
     """
+    return f"γ = {curve.gamma:g}, λ = {curve.gae_lambda:g}: {with_interval(result)}"
+
+
+def with_interval(result: Estimate) -> str:
+    """
+    :param result: at one point
+    :return: its interquartile mean and interval
+    """
     iqm, low, high = (rounded(float(part[0])) for part in result)
-    return f"γ = {curve.gamma:g}, λ = {curve.gae_lambda:g}: {iqm} [{low}, {high}]"
+    return f"{iqm} [{low}, {high}]"
 
 
 def rounded(value: float) -> str:

@@ -1,0 +1,84 @@
+"""Curves of a sweep from best to worst, with what the bands allow to say of their order."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from sb3_gae.sweep.conditions import CONDITIONS
+from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.figures.wording import with_interval
+from sb3_gae.sweep.grid import Curve
+from sb3_gae.sweep.series import RANKED_BY, at_iteration, series_of
+from sb3_gae.sweep.statistics import Estimate, difference, estimate_each
+
+
+class Rank(NamedTuple):
+    """
+    One curve among others; estimates have arrays of shape (1,).
+
+    :param curve: what its runs have in common
+    :param n_seeds: number of runs
+    :param training: mean return over all iterations, the area under the learning curve: how fast it learns
+    :param last: return at the chosen iteration
+    :param behind: how far the best curve is ahead, by the criterion of the ranking; None for the best itself
+    """
+
+    curve: Curve
+    n_seeds: int
+    training: Estimate
+    last: Estimate
+    behind: Estimate | None
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether the best one is ahead by more than chance would explain: the interval of the difference is above 0."""
+        return self.behind is not None and bool(self.behind.low[0] > 0.0)
+
+
+def rank_curves(table: pd.DataFrame, iteration: int | None = None, by: str = "training") -> list[Rank]:
+    """
+    :param table: selected by :func:`~sb3_gae.sweep.results.select`
+    :param iteration: from 1; None for the last. Later ones do not count
+    :param by: ``training`` or ``last``, see :class:`Rank`
+    :return: the best one first
+    :raises SweepError: if ``by`` is unknown, the runs are shorter, or in some no episode had ended by then
+    """
+    if by not in RANKED_BY:
+        raise SweepError(f"`by` must be one of {', '.join(RANKED_BY)}, got {by!r}.")
+    series = series_of(table)
+    last, iteration = at_iteration(series, iteration)
+    # In the first batches of long episodes none may have ended
+    training = [np.nanmean(one.returns[:, :iteration], axis=1) for one in series]
+    scores = training if by == "training" else last
+    of_training, of_last = estimate_each(training), estimate_each(last)
+    ranked = of_training if by == "training" else of_last
+    order = np.argsort([-float(found.iqm[0]) for found in ranked], kind="stable")
+    best = scores[order[0]]
+    return [
+        Rank(
+            series[place].curve,
+            series[place].n_seeds,
+            of_training[place],
+            of_last[place],
+            difference(best, scores[place]) if place != order[0] else None,
+        )
+        for place in order
+    ]
+
+
+def as_markdown(ranks: list[Rank]) -> str:
+    """
+    :param ranks: the best first
+    :return: a table
+    """
+    lines = [
+        "| condition | γ | λ | seeds | mean over training | at the end | behind the best by |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for curve, n_seeds, training, last, behind in ranks:
+        gae_lambda = "" if curve.gae_lambda is None else f"{curve.gae_lambda:g}"
+        cells = [CONDITIONS[curve.condition].title, f"{curve.gamma:g}", gae_lambda, str(n_seeds)]
+        cells += [with_interval(training), with_interval(last), "" if behind is None else with_interval(behind)]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
