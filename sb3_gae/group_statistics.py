@@ -38,26 +38,30 @@ class GradientErrors(NamedTuple):
     :param bias_squared: squared norm of the expected difference from the reference
     :param variance: trace of the covariance of the batch's mean gradient
     :param squared_norm: squared norm of the expected gradient
+    :param inner_product: of the expected gradient with the expected reference
     """
 
     bias_squared: Estimate
     variance: Estimate
     squared_norm: Estimate
+    inner_product: Estimate
 
 
-def squared_norm(sums: np.ndarray, weights: ArrayLike) -> Estimate:
-    """
+def squared_norm(sums: np.ndarray, weights: ArrayLike, duals: np.ndarray | None = None) -> Estimate:
+    r"""
     Squared norm of the expected mean.
 
     :param sums: of each group, shape (G, K, P)
     :param weights: of each group, shape (G,), or (G, K) where they differ between vectors
+    :param duals: what to take the products with: :math:`MX` for each vector :math:`X` of ``sums`` if squared norms are
+        :math:`X^\top MX`; None for the vectors themselves, shape (G, K, P)
     :return: units of ``sums`` over ``weights``, squared
     :raises ValueError: if there are fewer than two groups, or a shape does not fit
     """
-    return _jackknife(*_products(sums, weights), _cross_products)
+    return _jackknife(*_products(sums, weights, duals), _cross_products)
 
 
-def mean_variance(sums: np.ndarray, weights: ArrayLike) -> Estimate:
+def mean_variance(sums: np.ndarray, weights: ArrayLike, duals: np.ndarray | None = None) -> Estimate:
     r"""
     Variance of the mean over all groups, summed over components:
     :math:`\sum_j \|X_j - n_j\hat\mu\|^2 / (n^2 - \sum_j n_j^2)`. With two equal halves,
@@ -65,16 +69,19 @@ def mean_variance(sums: np.ndarray, weights: ArrayLike) -> Estimate:
 
     :param sums: of each group, shape (G, K, P)
     :param weights: of each group, shape (G,), or (G, K) where they differ between vectors
+    :param duals: see :func:`squared_norm`
     :return: units of ``sums`` over ``weights``, squared
     :raises ValueError: if there are fewer than two groups, or a shape does not fit
     """
-    products, checked = _products(sums, weights)
+    products, checked = _products(sums, weights, duals)
     whole = checked.sum(axis=0)
     # The mean over a part of the groups is the noisier the less there is of it
     return _jackknife(products, checked, lambda part, kept: _spread(part, kept) * kept.sum(axis=0) / whole)
 
 
-def gradient_errors(sums: np.ndarray, weights: ArrayLike, reference: int = -1) -> GradientErrors:
+def gradient_errors(
+    sums: np.ndarray, weights: ArrayLike, reference: int = -1, duals: np.ndarray | None = None
+) -> GradientErrors:
     r"""
     Bias and variance of gradients that differ in their advantages, from one batch.
 
@@ -83,25 +90,34 @@ def gradient_errors(sums: np.ndarray, weights: ArrayLike, reference: int = -1) -
     :param sums: policy gradients summed over each group, shape (G, K, P)
     :param weights: steps (or episodes) of each group, for errors of the mean over steps (or episodes), shape (G,)
     :param reference: index of the vector that is unbiased
+    :param duals: see :func:`squared_norm`
     :return: of the whole batch, each of shape (K,)
     :raises ValueError: if there are fewer than two groups, or a shape does not fit
     """
     sums = np.asarray(sums, dtype=np.float64)
-    difference = sums - sums[:, reference][:, None]
-    return GradientErrors(squared_norm(difference, weights), mean_variance(sums, weights), squared_norm(sums, weights))
+    duals = sums if duals is None else np.asarray(duals, dtype=np.float64)
+    of_reference = np.broadcast_to(duals[:, [reference]], duals.shape)
+    return GradientErrors(
+        bias_squared=squared_norm(sums - sums[:, [reference]], weights, duals - of_reference),
+        variance=mean_variance(sums, weights, duals),
+        squared_norm=squared_norm(sums, weights, duals),
+        inner_product=squared_norm(sums, weights, of_reference),
+    )
 
 
-def _products(sums: np.ndarray, weights: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def _products(sums: np.ndarray, weights: ArrayLike, duals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Inner products between groups, shape (K, G, G), which is all that is needed of the vectors; and weights, (G, K)."""
     sums, weights = np.asarray(sums, dtype=np.float64), np.asarray(weights, dtype=np.float64)
+    duals = sums if duals is None else np.asarray(duals, dtype=np.float64)
     if sums.ndim != 3 or len(sums) < 2:
         raise ValueError(f"`sums` must have the shape (G, K, P) with at least two groups, got {sums.shape}.")
     if weights.shape not in ((len(sums),), sums.shape[:2]) or not (weights > 0.0).all():
         raise ValueError(
             f"`weights` must be positive numbers of shape {(len(sums),)} or {sums.shape[:2]}, got the shape {weights.shape}."
         )
-    vectors = sums.swapaxes(0, 1)
-    return vectors @ vectors.swapaxes(1, 2), np.broadcast_to(weights.reshape(len(sums), -1), sums.shape[:2])
+    if duals.shape != sums.shape:
+        raise ValueError(f"`duals` must have the shape of `sums`, {sums.shape}, got {duals.shape}.")
+    return sums.swapaxes(0, 1) @ duals.transpose(1, 2, 0), np.broadcast_to(weights.reshape(len(sums), -1), sums.shape[:2])
 
 
 def _cross_products(products: np.ndarray, weights: np.ndarray) -> np.ndarray:

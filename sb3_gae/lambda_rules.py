@@ -1,21 +1,28 @@
 r"""Where :math:`\lambda` comes from when it is no fixed number: a schedule, or what the last batches showed."""
 
+import copy
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae.advantages import discounted_returns
-from sb3_gae.checks import check_number, check_unit_interval
+from sb3_gae.checks import check_choice, check_number, check_unit_interval
+from sb3_gae.collection import training_batch
 from sb3_gae.diagnostics import explained_variance
+from sb3_gae.natural_gradients import has_natural_gradients
+from sb3_gae.policy_step import policy_parameters
 from sb3_gae.rollout_buffer import GAERolloutBuffer
-from sb3_gae.rollout_diagnostics import has_several_trajectories, lambda_errors
+from sb3_gae.rollout_diagnostics import METRICS, expected_improvement, has_several_trajectories, lambda_errors
 
 #: what :class:`MeasuredLambda` chooses from
 MEASURED_LAMBDAS = (0.68, 0.84, 0.92, 0.96, 0.98, 0.99, 1.0)
+#: what it may choose by
+CRITERIA = ("improvement", "squared_error")
 
 
+@runtime_checkable
 class LambdaRule(Protocol):
     r"""A source of :math:`\lambda`. What it learns from one batch it applies to the next, so that no batch chooses its own."""
 
@@ -80,30 +87,44 @@ class ExplainedVarianceLambda:
 
 class MeasuredLambda:
     r"""
-    The :math:`\lambda` of a grid whose policy gradient has the least mean squared error, bias and variance together.
+    The :math:`\lambda` of a grid that is best by what the batches themselves show of the policy gradient.
 
-    Both are estimated from the batch itself (:func:`~sb3_gae.rollout_diagnostics.lambda_errors`). A batch alone says
-    little, so the estimates are averaged over batches, each in units of its own variance at :math:`\lambda = 1`
-    because gradients change their scale in training. From one batch to the next it moves by one place of the grid at most.
+    What is measured (:func:`~sb3_gae.rollout_diagnostics.lambda_errors`) says little in one batch, so it is
+    averaged over batches, each in units of its own variance at :math:`\lambda = 1` because gradients change their scale
+    in training. From one batch to the next it moves by one place of the grid at most.
 
     :param lambdas: the grid, ascending and ending with 1, which counts as unbiased
     :param start: where to begin; the nearest of the grid
     :param memory: weight of the past in the averages
     :param patience: batches to watch before the first move
-    :raises ValueError: if the grid is no ascending list in [0, 1] that ends with 1
+    :param criterion: ``"improvement"`` for the largest
+        :func:`~sb3_gae.rollout_diagnostics.expected_improvement`, ``"squared_error"`` for the least bias squared and variance
+    :param metric: of the gradients, ``"fisher"`` or ``"euclidean"``. Policies that are no MLP as SB3 builds it have
+        the latter in any case
+    :raises ValueError: if the grid is no ascending list in [0, 1] that ends with 1, or a name is unknown
     """
 
     def __init__(
-        self, lambdas: Sequence[float] = MEASURED_LAMBDAS, start: float = 0.96, memory: float = 0.95, patience: int = 5
+        self,
+        lambdas: Sequence[float] = MEASURED_LAMBDAS,
+        start: float = 0.96,
+        memory: float = 0.95,
+        patience: int = 5,
+        criterion: str = "improvement",
+        metric: str = "fisher",
     ):
         check_unit_interval("lambdas", lambdas)
         if lambdas[-1] != 1.0 or not np.all(np.diff(lambdas) > 0):
             raise ValueError(f"`lambdas` must ascend and end with 1, got {lambdas!r}.")
+        check_choice("criterion", criterion, CRITERIA)
+        check_choice("metric", metric, METRICS)
         self.lambdas = tuple(lambdas)
         self.memory = memory
         self.patience = patience
+        self.criterion = criterion
+        self.metric = metric
         self.place = int(np.argmin(np.abs(np.subtract(lambdas, start))))
-        self._sums = np.zeros((2, len(lambdas)))
+        self._sums = np.zeros((4, len(lambdas)))
         self._weight = 0.0
         self._n_batches = 0
 
@@ -113,25 +134,42 @@ class MeasuredLambda:
     def learn_from(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> dict[str, float]:
         if not has_several_trajectories(rollout_buffer):
             return {}
-        errors = lambda_errors(policy, rollout_buffer, self.lambdas)
-        scale = errors.variance[-1]
-        if not np.isfinite(errors.squared_error).all() or scale <= 0.0:
+        errors = lambda_errors(policy, rollout_buffer, self.lambdas, metric=self._metric_for(policy, rollout_buffer))
+        squared_length, scale = errors.squared_norm + errors.variance, errors.variance[-1]
+        found = np.stack([errors.bias_squared, errors.variance, errors.inner_product, squared_length])
+        if not np.isfinite(found).all() or scale <= 0.0:
             return {}
-        self._sums = self.memory * self._sums + np.stack([errors.bias_squared, errors.variance]) / scale
+        self._sums = self.memory * self._sums + found / scale
         self._weight = self.memory * self._weight + 1.0
         self._n_batches += 1
-        bias_squared, variance = self._sums / self._weight
+        bias_squared, variance, inner_product, squared_length = self._sums / self._weight
+        improvement = expected_improvement(inner_product, squared_length)
         if self._n_batches >= self.patience:
-            self._move(np.maximum(bias_squared, 0.0) + variance)
+            self._move(improvement if self.criterion == "improvement" else -(np.maximum(bias_squared, 0.0) + variance))
         return {
             f"{quantity}/lambda_{gae_lambda:g}": float(estimate)
-            for quantity, estimates in (("bias_squared", bias_squared), ("variance", variance))
+            for quantity, estimates in (("bias_squared", bias_squared), ("variance", variance), ("improvement", improvement))
             for gae_lambda, estimate in zip(self.lambdas, estimates, strict=True)
         }
 
-    def _move(self, squared_error: np.ndarray) -> None:
-        best = int(np.argmin(squared_error))
-        self.place += int(np.sign(best - self.place))
+    def _metric_for(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> str:
+        batch = training_batch(rollout_buffer, policy.action_space)
+        known = has_natural_gradients(policy, policy_parameters(policy, batch), batch)
+        return self.metric if known else "euclidean"
+
+    def _move(self, merit: np.ndarray) -> None:
+        best = int(np.argmax(merit))
+        # Where no step is expected to gain anything, noise is all there is to choose by
+        if self.criterion != "improvement" or merit[best] > 0.0:
+            self.place += int(np.sign(best - self.place))
+
+
+#: what ``gae_lambda`` may be as a text
+_NAMED_RULES: dict[str, Callable[[], LambdaRule]] = {
+    "auto": MeasuredLambda,
+    "least_squared_error": lambda: MeasuredLambda(criterion="squared_error", metric="euclidean"),
+    "explained_variance": ExplainedVarianceLambda,
+}
 
 
 def lambda_rule(gae_lambda: Any) -> LambdaRule | None:
@@ -140,15 +178,17 @@ def lambda_rule(gae_lambda: Any) -> LambdaRule | None:
     :return: a rule, None for a number, which needs none
     :raises ValueError: if it is none of what is allowed
     """
+    if isinstance(gae_lambda, LambdaRule):
+        # Two models must not learn in one
+        return copy.deepcopy(gae_lambda)
     if callable(gae_lambda):
         return ScheduledLambda(gae_lambda)
     if isinstance(gae_lambda, str):
-        if gae_lambda == "auto":
-            return MeasuredLambda()
-        if gae_lambda == "explained_variance":
-            return ExplainedVarianceLambda()
+        if gae_lambda in _NAMED_RULES:
+            return _NAMED_RULES[gae_lambda]()
+        names = ", ".join(map(repr, _NAMED_RULES))
         raise ValueError(
-            "`gae_lambda` must be a number in [0, 1], a function of the remaining progress, 'auto' or 'explained_variance', "
+            f"`gae_lambda` must be a number in [0, 1], a function of the remaining progress, a rule, or one of {names}, "
             f"got {gae_lambda!r}."
         )
     return None

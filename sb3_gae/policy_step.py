@@ -165,6 +165,8 @@ class DenseFisher:
         with th.no_grad():
             old = snapshot(distribution_from_outputs(policy.action_dist, self._outputs, policy_log_std(policy)))
         self._metric = fisher_metric(old)
+        #: in the order of vectors
+        self.parameters: list[th.Tensor] = [*self._network.parameters, *policy_log_std(policy)]
 
     def product(self, vector: th.Tensor) -> th.Tensor:
         """

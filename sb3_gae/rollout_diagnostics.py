@@ -13,14 +13,18 @@ import numpy as np
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae.advantages import advantage_grid, td_residuals
-from sb3_gae.checks import check_count, check_number, check_unit_interval
+from sb3_gae.checks import check_choice, check_count, check_number, check_unit_interval
 from sb3_gae.collection import training_batch
 from sb3_gae.diagnostics import lagged_signal
 from sb3_gae.gradient_diagnostics import policy_gradients
 from sb3_gae.group_statistics import Estimate, gradient_errors, squared_norm
+from sb3_gae.natural_gradients import natural_gradients
 from sb3_gae.policy_step import policy_parameters
 from sb3_gae.rollout_buffer import GAERolloutBuffer
 from sb3_gae.trajectory_groups import trajectory_groups, trajectory_indices
+
+#: of norms and inner products of policy gradients
+METRICS = ("euclidean", "fisher")
 
 
 class LambdaErrors(NamedTuple):
@@ -34,6 +38,7 @@ class LambdaErrors(NamedTuple):
     :param variance_error: its standard error
     :param squared_error: the sum of bias squared, none below zero, and variance: what a choice of :math:`\lambda` minimises
     :param squared_norm: of the expected gradient, to compare the errors with; may come out below zero
+    :param inner_product: of the expected gradient with that of :math:`\lambda = 1`; may come out below zero
     """
 
     gae_lambda: np.ndarray
@@ -43,6 +48,12 @@ class LambdaErrors(NamedTuple):
     variance_error: np.ndarray
     squared_error: np.ndarray
     squared_norm: np.ndarray
+    inner_product: np.ndarray
+
+    @property
+    def improvement(self) -> np.ndarray:
+        r"""See :func:`expected_improvement`."""
+        return expected_improvement(self.inner_product, self.squared_norm + self.variance)
 
 
 class ResponseEstimate(NamedTuple):
@@ -56,6 +67,22 @@ class ResponseEstimate(NamedTuple):
 
     rewards: Estimate
     shaped_rewards: Estimate
+
+
+def expected_improvement(inner_product: np.ndarray, squared_length: np.ndarray) -> np.ndarray:
+    r"""
+    What a step of unit length along the batch's gradient :math:`\hat g_\lambda` gains on average, to first order:
+    :math:`\langle g, E\hat g_\lambda\rangle / \sqrt{E\|\hat g_\lambda\|^2}`.
+
+    A trust region fixes the length of a step in the Fisher metric. So a gradient that is only too short, as a small
+    :math:`\lambda` makes it, costs nothing, unlike in the squared error; what counts is how well it points.
+
+    :param inner_product: of the expected gradient with an unbiased one's expectation
+    :param squared_length: mean squared norm of the batch's gradient: that of its expectation, and its variance
+    :return: same shape, in units of a gradient; zero where the length is
+    """
+    length = np.sqrt(np.maximum(squared_length, 0.0))
+    return np.divide(inner_product, length, out=np.zeros_like(length), where=length > 0.0)
 
 
 def has_several_trajectories(rollout_buffer: GAERolloutBuffer) -> bool:
@@ -72,6 +99,7 @@ def lambda_errors(
     lambdas: Sequence[float],
     gamma: float | None = None,
     n_groups: int = 16,
+    metric: str = "euclidean",
 ) -> LambdaErrors:
     r"""
     Bias and variance of the policy gradient for each :math:`\lambda`, from the rollout alone.
@@ -84,16 +112,23 @@ def lambda_errors(
     :param lambdas: weights of longer estimates, each in [0, 1], shape (L,)
     :param gamma: discount factor, None for the buffer's own
     :param n_groups: of trajectories; more than 16 lower the noise little
+    :param metric: of norms and products: ``"euclidean"``, or ``"fisher"`` for :math:`\|g\|^2 = g^\top F^{-1} g`, which is
+        what a trust-region step goes by; see :mod:`sb3_gae.natural_gradients`
     :return: see :class:`LambdaErrors`
-    :raises ValueError: if the buffer is not full, has a single trajectory, or a factor is out of range
+    :raises ValueError: if the buffer is not full, has a single trajectory, a factor is out of range, or the metric is unknown
     """
     check_unit_interval("lambdas", lambdas)
+    check_choice("metric", metric, METRICS)
     gamma = _checked_gamma(rollout_buffer, gamma)
     rewards, values, next_values = _td_arrays(rollout_buffer)
     advantages = advantage_grid(rewards, values, next_values, rollout_buffer.dones, [gamma], [*lambdas, 1.0])[0]
     sums, groups = _gradient_sums(policy, rollout_buffer, advantages, n_groups)
-    errors = gradient_errors(sums, np.bincount(groups))
-    bias, variance, norm = (Estimate(*(array[:-1] for array in each)) for each in errors)
+    duals = None
+    if metric == "fisher":
+        batch = training_batch(rollout_buffer, policy.action_space)
+        duals = natural_gradients(policy, policy_parameters(policy, batch), batch, sums)
+    errors = gradient_errors(sums, np.bincount(groups), duals=duals)
+    bias, variance, norm, product = (Estimate(*(array[:-1] for array in each)) for each in errors)
     return LambdaErrors(
         gae_lambda=np.asarray(lambdas, dtype=np.float64),
         bias_squared=bias.value,
@@ -102,6 +137,7 @@ def lambda_errors(
         variance_error=variance.standard_error,
         squared_error=np.maximum(bias.value, 0.0) + variance.value,
         squared_norm=norm.value,
+        inner_product=product.value,
     )
 
 

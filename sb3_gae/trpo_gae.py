@@ -69,9 +69,10 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
     :param line_search_max_iter: largest number of trials
     :param n_critic_updates: Adam's epochs; read only with ``vf_optimizer="adam"`` (default: 10)
     :param gae_lambda: :math:`\lambda` of the advantages: 0 trusts the value function, 1 the returns. A function of the
-        remaining progress for a schedule; ``"auto"`` to choose it by the measured error of the policy gradient
-        (:class:`~sb3_gae.lambda_rules.MeasuredLambda`); ``"explained_variance"`` for the simple rule that this is to be
-        compared with. The attribute ``gae_lambda`` is always the number in use
+        remaining progress for a schedule; ``"auto"`` to choose it by what rollouts show of the policy gradient
+        (:class:`~sb3_gae.lambda_rules.MeasuredLambda`); ``"least_squared_error"`` and ``"explained_variance"`` for rules that
+        this is to be compared with; or a rule of :mod:`sb3_gae.lambda_rules`. The attribute ``gae_lambda`` is always
+        the number in use
     :param use_sde: whether to use generalized state-dependent exploration
     :param sde_sample_freq: sample a new noise matrix every so many steps; -1 only at the start of a rollout
     :param rollout_buffer_class: a subclass of :class:`~sb3_gae.GAERolloutBuffer`; None to choose by the observations
@@ -132,7 +133,7 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         line_search_shrinking_factor: float = 0.8,
         line_search_max_iter: int = 10,
         n_critic_updates: int | None = None,
-        gae_lambda: float | str | Callable[[float], float] = 0.95,
+        gae_lambda: float | str | Callable[[float], float] | LambdaRule = 0.95,
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         rollout_buffer_class: type[RolloutBuffer] | None = None,

@@ -26,6 +26,27 @@ def test_estimates_are_the_sums_over_pairs_of_groups(seed: int, n_groups: int, n
         assert mean_variance(sums, weights).value[vector] == pytest.approx(expected)
 
 
+@given(st.integers(0, 1000), st.integers(2, 5), st.integers(1, 4))
+def test_a_metric_is_a_change_of_coordinates(seed: int, n_groups: int, n_parameters: int) -> None:
+    generator = np.random.default_rng(seed)
+    sums, root = generator.normal(size=(n_groups, 3, n_parameters)), generator.normal(size=(n_parameters, n_parameters))
+    weights = generator.uniform(1, 5, n_groups)
+    in_metric = gradient_errors(sums, weights, duals=sums @ (root @ root.T))
+    for found, expected in zip(in_metric, gradient_errors(sums @ root, weights), strict=True):
+        np.testing.assert_allclose(found.value, expected.value, rtol=1e-8, atol=1e-10)
+
+
+def test_inner_products_are_those_with_the_reference_in_other_groups() -> None:
+    generator = np.random.default_rng(0)
+    sums, weights = generator.normal(size=(4, 3, 5)), generator.uniform(1, 5, 4)
+    pairs = [(j, k) for j in range(4) for k in range(4) if j != k]
+    products = np.sum([(sums[j] @ sums[k, 1]) for j, k in pairs], axis=0)
+    expected = products / sum(weights[j] * weights[k] for j, k in pairs)
+    errors = gradient_errors(sums, weights, reference=1)
+    np.testing.assert_allclose(errors.inner_product.value, expected)
+    assert errors.inner_product.value[1] == pytest.approx(errors.squared_norm.value[1])
+
+
 def test_two_equal_halves_give_the_product_and_the_quarter_of_the_difference() -> None:
     sums = np.random.default_rng(0).normal(size=(2, 3, 7))
     (first, second), errors = sums / 5.0, gradient_errors(sums, [5.0, 5.0])
@@ -80,10 +101,13 @@ def test_errors_of_lambda_on_the_gridworld_are_the_exact_ones_on_average(n_group
     errors = [gradient_errors(batch.sum(axis=1), np.full(n_groups, n_episodes // n_groups)) for batch in gradients]
     truth = policy.lambda_curve(values, gamma, lambdas)
     norms = [np.square(policy.expected_gradient(values, gamma, gae_lambda)).sum() for gae_lambda in lambdas]
+    true = policy.true_gradient(gamma)
+    products = [np.sum(policy.expected_gradient(values, gamma, gae_lambda) * true) for gae_lambda in lambdas]
     for name, expected in (
         ("bias_squared", truth.bias_squared),
         ("variance", truth.variance / n_episodes),
         ("squared_norm", norms),
+        ("inner_product", products),
     ):
         estimates = np.array([getattr(each, name).value for each in errors])
         limits = 4.0 * estimates.std(axis=0) / np.sqrt(n_batches) + 1e-12
@@ -103,6 +127,8 @@ def test_refuses_what_has_no_groups(shape: tuple[int, ...], weights: list[float]
     for estimate in (squared_norm, mean_variance):
         with pytest.raises(ValueError, match=message):
             estimate(np.zeros(shape), weights)
+        with pytest.raises(ValueError, match="`duals` must have the shape of `sums`"):
+            estimate(np.zeros((2, 2, 3)), [1.0, 1.0], np.zeros((2, 1, 3)))
 
 
 # --- Who belongs to which group ---

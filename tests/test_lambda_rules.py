@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from sb3_gae import TRPOGAE
 from sb3_gae.advantages import discounted_returns
 from sb3_gae.gridworld import TabularPolicy, gridworld
 from sb3_gae.lambda_rules import ExplainedVarianceLambda, MeasuredLambda
-from sb3_gae.rollout_diagnostics import LambdaErrors
+from sb3_gae.rollout_diagnostics import LambdaErrors, lambda_errors
 
 GRID = (0.0, 0.5, 0.8, 0.9, 0.96, 1.0)
 
@@ -32,72 +32,125 @@ class RolloutLog(BaseCallback):
         self.entries.append(dict(self.logger.name_to_value))
 
 
-def feed(rule: MeasuredLambda, monkeypatch: pytest.MonkeyPatch, batches: Sequence[tuple[Any, Any]]) -> list[float]:
-    """Let it see these estimates of bias squared and variance, and return where it was before each and at the end."""
+class Batch(NamedTuple):
+    """What one batch shows, for each λ of :data:`GRID`."""
+
+    bias_squared: np.ndarray
+    variance: np.ndarray
+    squared_norm: np.ndarray = np.ones(len(GRID))
+    inner_product: np.ndarray = np.ones(len(GRID))
+
+    def times(self, factor: float) -> "Batch":
+        return Batch(*(factor * part for part in self))
+
+
+def feed(rule: MeasuredLambda, monkeypatch: pytest.MonkeyPatch, batches: Sequence[Batch]) -> list[float]:
+    """Let it see these batches, and return where it was before each and at the end."""
     places = [rule.value(1.0)]
     monkeypatch.setattr("sb3_gae.lambda_rules.has_several_trajectories", lambda buffer: True)
-    for bias_squared, variance in batches:
-        bias, var, nothing = np.asarray(bias_squared), np.asarray(variance), np.zeros(len(rule.lambdas))
-        errors = LambdaErrors(np.array(rule.lambdas), bias, nothing, var, nothing, np.maximum(bias, 0) + var, nothing)
-        monkeypatch.setattr("sb3_gae.lambda_rules.lambda_errors", lambda *args, errors=errors: errors)
+    monkeypatch.setattr(MeasuredLambda, "_metric_for", lambda *args: "euclidean")
+    nothing = np.zeros(len(GRID))
+    for bias, variance, norm, product in batches:
+        errors = LambdaErrors(np.array(GRID), bias, nothing, variance, nothing, nothing, norm, product)
+        monkeypatch.setattr("sb3_gae.lambda_rules.lambda_errors", lambda *args, errors=errors, **options: errors)
         rule.learn_from(None, None)  # type: ignore[arg-type]
         places.append(rule.value(1.0))
     return places
 
 
-def exact_curve(scale_of_errors: float) -> tuple[np.ndarray, np.ndarray]:
-    """True bias squared and variance on the gridworld, with values that are wrong by so much."""
+def exact_batch(scale_of_errors: float) -> Batch:
+    """The truth on the gridworld for batches of 40 episodes, with values that are wrong by so much."""
     mdp = gridworld()
     policy = TabularPolicy(mdp, np.random.default_rng(0).normal(size=mdp.rewards.shape[:2]) * 0.5)
     values = policy.values(0.95)
     wrong = values + scale_of_errors * np.random.default_rng(1).normal(size=values.shape) * ~mdp.terminal
     curve = policy.lambda_curve(wrong, 0.95, GRID)
-    return curve.bias_squared, curve.variance / 40.0
+    gradients = np.stack([policy.expected_gradient(wrong, 0.95, gae_lambda).ravel() for gae_lambda in GRID])
+    norms = np.square(gradients).sum(axis=1)
+    return Batch(curve.bias_squared, curve.variance / 40.0, norms, gradients @ policy.true_gradient(0.95).ravel())
 
 
+def merits(batch: Batch) -> dict[str, np.ndarray]:
+    """What each criterion makes of it, the more the better."""
+    return {
+        "squared_error": -(batch.bias_squared + batch.variance),
+        "improvement": batch.inner_product / np.sqrt(batch.squared_norm + batch.variance),
+    }
+
+
+@pytest.mark.parametrize("criterion", ["squared_error", "improvement"])
 @pytest.mark.parametrize("scale_of_errors", [0.0, 0.3, 3.0, 30.0])
-def test_it_finds_the_best_lambda_of_the_exact_gridworld(scale_of_errors: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """From true errors under noise of their own size, unbiased as the estimates are."""
-    bias, variance = exact_curve(scale_of_errors)
-    best = float(np.min(bias + variance))
-    rng = np.random.default_rng(2)
-    batches = [
-        (bias + rng.normal(size=len(GRID)) * (bias + 0.1 * variance), variance * rng.uniform(0.7, 1.3, len(GRID)))
-        for _ in range(80)
-    ]
-    rule = MeasuredLambda(GRID)
+def test_it_finds_the_best_lambda_of_the_exact_gridworld(
+    scale_of_errors: float, criterion: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the truth under noise of its own size, unbiased as the estimates are."""
+    truth, rng = exact_batch(scale_of_errors), np.random.default_rng(2)
+    batches = []
+    for _ in range(80):
+        noise = rng.normal(size=(3, len(GRID)))
+        bias = truth.bias_squared + noise[0] * (truth.bias_squared + 0.1 * truth.variance)
+        norm, product = truth.squared_norm * (1.0 + noise[1]), truth.inner_product * (1.0 + noise[2])
+        batches.append(Batch(bias, truth.variance * rng.uniform(0.7, 1.3, len(GRID)), norm, product))
+    rule = MeasuredLambda(GRID, criterion=criterion)
     feed(rule, monkeypatch, batches)
-    assert (bias + variance)[rule.place] <= 1.25 * best
+    merit = merits(truth)[criterion]
+    assert abs(merit[rule.place] - merit.max()) <= 0.25 * abs(merit.max())
 
 
-def test_the_best_lambda_depends_on_the_value_function() -> None:
+@pytest.mark.parametrize("criterion", ["squared_error", "improvement"])
+def test_the_best_lambda_depends_on_the_value_function(criterion: str) -> None:
     """So that the test above asks for different answers."""
-    chosen = [GRID[int(np.argmin(sum(exact_curve(scale))))] for scale in (0.0, 0.3, 30.0)]
-    assert chosen[0] < chosen[1] < chosen[2] == 1.0
+    chosen = [GRID[int(np.argmax(merits(exact_batch(scale))[criterion]))] for scale in (0.0, 0.3, 30.0)]
+    assert chosen[0] < chosen[1] < chosen[2]
+
+
+def test_improvement_does_not_mind_a_gradient_that_is_only_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tenth of the true gradient, with a tenth of the deviation, points as well: here a little better than the whole."""
+    length = np.array([0.1, 0.3, 0.5, 0.7, 0.9, 1.0])
+    batch = Batch((1.0 - length) ** 2, np.square(length) * np.arange(0.90, 1.01, 0.02), np.square(length), length)
+    chosen = {name: feed(MeasuredLambda(GRID, criterion=name), monkeypatch, [batch] * 20)[-1] for name in merits(batch)}
+    assert chosen == {"squared_error": 0.8, "improvement": 0.0}
+
+
+def test_where_nothing_is_to_be_gained_it_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    hopeless = Batch(np.zeros(6), np.ones(6), np.zeros(6), -np.arange(1.0, 7.0))
+    assert feed(MeasuredLambda(GRID), monkeypatch, [hopeless] * 20)[-1] == 0.96
 
 
 def test_it_waits_and_then_moves_by_one_place_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    variance_alone = (np.zeros(6), np.arange(1.0, 7.0))
-    places = feed(MeasuredLambda(GRID, patience=3), monkeypatch, [variance_alone] * 8)
-    assert places == [0.96, 0.96, 0.96, 0.9, 0.8, 0.5, 0.0, 0.0, 0.0]
+    variance_alone = Batch(np.zeros(6), np.arange(1.0, 7.0))
+    for criterion in ("squared_error", "improvement"):
+        places = feed(MeasuredLambda(GRID, patience=3, criterion=criterion), monkeypatch, [variance_alone] * 8)
+        assert places == [0.96, 0.96, 0.96, 0.9, 0.8, 0.5, 0.0, 0.0, 0.0]
 
 
-def test_batches_count_in_units_of_their_own_variance(monkeypatch: pytest.MonkeyPatch) -> None:
-    for scale in (1e-12, 1.0, 1e12):
-        batches = [(np.array([9.0, 3, 1, 0.1, 0, 0]), np.arange(1.0, 7.0))] * 5
-        scaled = [(scale * bias, scale * variance) for bias, variance in batches]
-        # A batch on a scale of its own does not outvote the others
-        mixed = [*batches, (1e20 * np.zeros(6), 1e20 * np.arange(6.0, 0.0, -1.0)), *batches]
-        assert feed(MeasuredLambda(GRID), monkeypatch, scaled)[-1] == feed(MeasuredLambda(GRID), monkeypatch, batches)[-1]
-        assert feed(MeasuredLambda(GRID), monkeypatch, mixed)[-1] == 0.9
+@pytest.mark.parametrize("criterion", ["squared_error", "improvement"])
+def test_batches_count_in_units_of_their_own_variance(criterion: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    bias, length = np.array([9.0, 3, 1, 0.1, 0, 0]), np.array([0.1, 0.2, 0.5, 0.99, 1.0, 1.0])
+    batch = Batch(bias, np.arange(1.0, 7.0), np.square(length), length)
+    last = Batch(1e20 * np.zeros(6), 1e20 * np.arange(6.0, 0.0, -1.0), np.zeros(6), 1e20 * length)
+
+    def chosen(batches: list[Batch]) -> float:
+        return feed(MeasuredLambda(GRID, criterion=criterion), monkeypatch, batches)[-1]
+
+    assert {chosen([batch.times(scale)] * 5) for scale in (1e-12, 1.0, 1e12)} == {0.9}
+    # A batch on a scale of its own does not outvote the others
+    assert chosen([*[batch] * 5, last, *[batch] * 5]) == 0.9
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_estimates_that_are_no_numbers_change_nothing(bad: float, monkeypatch: pytest.MonkeyPatch) -> None:
     rule = MeasuredLambda(GRID, patience=1)
-    feed(rule, monkeypatch, [(np.full(6, bad), np.ones(6)), (np.zeros(6), np.zeros(6))])
+    ones = np.ones(6)
+    feed(rule, monkeypatch, [Batch(bad * ones, ones), Batch(ones, ones, ones, bad * ones), Batch(0 * ones, 0 * ones)])
     assert rule.value(1.0) == 0.96
     assert rule._n_batches == 0
+
+
+@pytest.mark.parametrize("argument", ["criterion", "metric"])
+def test_names_that_are_unknown_are_refused(argument: str) -> None:
+    with pytest.raises(ValueError, match=f"`{argument}` must be one of"):
+        MeasuredLambda(**{argument: "best"})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("lambdas", [(0.5, 0.9), (0.9, 0.5, 1.0), (0.5, 0.5, 1.0), (), (-0.1, 1.0)])
@@ -143,6 +196,34 @@ def test_auto_is_logged_and_applied_to_the_next_batch(monkeypatch: pytest.Monkey
         assert "gae_lambda/bias_squared/lambda_1" in log
         used.append(expected)
     assert len(set(used)) > 1
+
+
+def test_a_rule_of_ones_own_is_copied_for_each_model() -> None:
+    rule = MeasuredLambda(GRID, start=0.5, patience=1)
+    models = [small_model(vec_env(n_envs=4), n_steps=40, gae_lambda=rule) for _ in range(2)]
+    assert [model.gae_lambda for model in models] == [0.5, 0.5]
+    train_once(models[0])
+    assert models[0]._lambda_rule._n_batches == 1  # type: ignore[union-attr]
+    assert models[1]._lambda_rule._n_batches == rule._n_batches == 0  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(("name", "criterion"), [("auto", "improvement"), ("least_squared_error", "squared_error")])
+def test_names_of_rules(name: str, criterion: str) -> None:
+    rule = small_model(vec_env(), gae_lambda=name)._lambda_rule
+    assert isinstance(rule, MeasuredLambda) and rule.criterion == criterion
+
+
+def test_networks_of_other_kinds_are_measured_in_the_euclidean_metric(monkeypatch: pytest.MonkeyPatch) -> None:
+    metrics = []
+
+    def recorded(*args: Any, metric: str, **options: Any) -> LambdaErrors:
+        metrics.append(metric)
+        return lambda_errors(*args, metric=metric, **options)
+
+    monkeypatch.setattr("sb3_gae.lambda_rules.lambda_errors", recorded)
+    for options in ({}, {"use_sde": True}):
+        train_once(small_model(vec_env(n_envs=4), n_steps=40, gae_lambda="auto", **options))
+    assert metrics == ["fisher", "euclidean"]
 
 
 def test_a_schedule_is_followed() -> None:

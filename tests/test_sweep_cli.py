@@ -41,6 +41,18 @@ def test_from_a_dry_run_to_figures(capsys: pytest.CaptureFixture[str]) -> None:
     assert "| value function by trust region | 0.9 | 1 | 2 |" in capsys.readouterr().out
 
 
+def test_results_of_several_sweeps_go_into_one_table(capsys: pytest.CaptureFixture[str]) -> None:
+    for name, condition in (("fixed", "trust_region"), ("auto", "measured_lambda")):
+        assert main([*RUN, "--gammas", ".9", "--seeds", "1", "--name", name, "--conditions", condition, *TINY]) == 0
+        assert main(["export", "--name", name, "-o", f"{name}.csv"]) == 0
+    capsys.readouterr()
+    assert main(["rank", "--from", "fixed.csv", "auto.csv"]) == 0
+    said = capsys.readouterr().out
+    assert (
+        "| value function by trust region | 0.9 | 1 | 1 |" in said and "| λ by the measured improvement | 0.9 |  | 1 |" in said
+    )
+
+
 def test_cells_that_fail_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     grid = [*RUN, "--gammas", ".9", "--seeds", "1", "-params", "n_envs:1", "n_steps:1"]
     assert main(grid) == 1

@@ -92,7 +92,7 @@ def _add_rank(parser: argparse.ArgumentParser) -> None:
 def _add_selection(parser: argparse.ArgumentParser) -> None:
     """Results and which of them; :func:`selection_of` reads the latter."""
     _add_study(parser)
-    parser.add_argument("--from", dest="source", metavar="FILE", help="an exported file, in place of a storage")
+    parser.add_argument("--from", dest="sources", nargs="+", metavar="FILE", help="exported files, in place of a storage")
     parser.add_argument("--env", nargs="+", help="only these tasks")
     parser.add_argument("--conditions", nargs="+", help="only these")
     parser.add_argument("--gammas", nargs="+", type=float, help="only these")

@@ -139,10 +139,11 @@ def _rank(args: argparse.Namespace) -> int:
 
 def _results_of(args: argparse.Namespace) -> tuple[pd.DataFrame, str]:
     """The table that a command names, and a name for files that are made of it."""
-    if args.source is not None:
+    if args.sources is not None:
         if args.storage is not None or args.name is not None or args.preset is not None:
-            raise SweepError("`from` names a file; leave out --storage, --name and --preset, or --from.")
-        return read_results(args.source), Path(args.source).name.split(".")[0]
+            raise SweepError("`from` names files; leave out --storage, --name and --preset, or --from.")
+        tables = [read_results(source) for source in args.sources]
+        return pd.concat(tables, ignore_index=True), Path(args.sources[0]).name.split(".")[0]
     study = _study_of(args)
     return results_of(study), study.name
 

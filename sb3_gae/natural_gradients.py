@@ -1,0 +1,79 @@
+r"""
+Policy gradients as a trust region sees them: :math:`F^{-1}g`, with :math:`F` the mean Fisher matrix.
+
+Solving for many gradients exactly would take longer than the update that they belong to. A Kronecker-factored approximation
+of :math:`F` (K-FAC) is inverted once for all of them.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy
+
+from sb3_gae.batch import TrainingBatch
+from sb3_gae.dense_policy import has_dense_policy
+from sb3_gae.policy_step import DenseFisher
+
+# Second moments of so many samples are good enough for a metric
+_MOST_SAMPLES = 8192
+
+
+def natural_gradients(
+    policy: ActorCriticPolicy,
+    parameters: Sequence[th.Tensor],
+    batch: TrainingBatch,
+    gradients: np.ndarray,
+    damping: float = 0.1,
+) -> np.ndarray:
+    r"""
+    About :math:`(F + d)^{-1} g` for each gradient, by one symmetric and positive matrix for all of them.
+
+    :param policy: an MLP as SB3 builds it
+    :param parameters: what the gradients are by, P scalars in all, see :func:`~sb3_gae.policy_step.policy_parameters`
+    :param batch: observations and the actions that the policy drew for them
+    :param gradients: shape (..., P)
+    :param damping: :math:`d`, positive
+    :return: same shape
+    :raises ValueError: if the policy is of another kind
+    """
+    fisher = _prepared_fisher(policy, parameters, batch)
+    if fisher is None:
+        raise ValueError("Natural gradients need a policy that is an MLP as SB3 builds it, with layers no wider than 512.")
+    places = _places(parameters, fisher.parameters)
+    dtype, device = parameters[0].dtype, parameters[0].device
+    result = np.empty_like(gradients)
+    for index in np.ndindex(gradients.shape[:-1]):
+        # Unit length, so that gradients of 1e-30 and 1e30 come out alike in single precision
+        length = float(np.linalg.norm(gradients[index])) or 1.0
+        vector = th.as_tensor(gradients[index][places] / length, dtype=dtype, device=device)
+        result[index][places] = length * fisher.precondition(vector, damping).cpu().double().numpy()
+    return result
+
+
+def has_natural_gradients(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor], batch: TrainingBatch) -> bool:
+    """
+    :param policy: any actor-critic policy
+    :param parameters: see :func:`~sb3_gae.policy_step.policy_parameters`
+    :param batch: at least one sample
+    :return: whether :func:`natural_gradients` knows this kind of policy
+    """
+    one = batch.take(th.zeros(1, dtype=th.long, device=batch.advantages.device))
+    return _prepared_fisher(policy, parameters, one) is not None
+
+
+def _prepared_fisher(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor], batch: TrainingBatch) -> DenseFisher | None:
+    if not has_dense_policy(policy, parameters):
+        return None
+    # Evenly spaced: random ones would come out of the generator that training draws from
+    spread = th.arange(0, len(batch), -(-len(batch) // _MOST_SAMPLES), device=batch.advantages.device)
+    part = batch.take(spread)
+    fisher = DenseFisher(policy, part.observations)
+    return fisher if fisher.prepare(part.actions) else None
+
+
+def _places(parameters: Sequence[th.Tensor], order: Sequence[th.Tensor]) -> np.ndarray:
+    """Where the scalars of each tensor of ``order`` are in vectors over ``parameters``."""
+    ends = np.cumsum([parameter.numel() for parameter in parameters])
+    of = {id(parameter): np.arange(end - parameter.numel(), end) for parameter, end in zip(parameters, ends, strict=True)}
+    return np.concatenate([of[id(parameter)] for parameter in order])
