@@ -72,6 +72,7 @@ def test_cells_that_fail_are_told(capsys: pytest.CaptureFixture[str]) -> None:
         ([*RUN, "--gammas", "1", "--seeds", "1", "--conditions", "none"], "`conditions` knows"),
         (["run", "--preset", "fig2"], "`preset` knows"),
         (["status"], "Which sweep?"),
+        (["import", "nothing.csv", "--name", "s"], "There is no results file nothing.csv"),
         (["status", "--preset", "small"], "There is no sweep at logs/sweeps/small.journal"),
         (["figure", "curves", "--from", "nothing.csv"], "There is no results file nothing.csv"),
         (["figure", "curves", "--from", "nothing.csv", "--name", "s"], "leave out --storage, --name and --preset"),

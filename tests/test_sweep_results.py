@@ -15,11 +15,14 @@ from sb3_gae.sweep.figures.curves import curves_figure
 from sb3_gae.sweep.figures.heatmap import heatmap_figure
 from sb3_gae.sweep.figures.lambda_curve import lambda_figure
 from sb3_gae.sweep.grid import cells_of, product
+from sb3_gae.sweep.ledger import Status
 from sb3_gae.sweep.provenance import provenance
 from sb3_gae.sweep.recorder import COLUMNS
+from sb3_gae.sweep.results import COLUMNS as COLUMNS_OF_TABLE
 from sb3_gae.sweep.results import rows_of_cells
 from sb3_gae.sweep.series import series_of
 from sb3_gae.sweep.statistics import estimate, estimate_each, interquartile_mean
+from sb3_gae.sweep.take_in import take_in
 
 CURVES = [Curve(0.9, None, "no_vf"), *product(["trust_region"], [0.9, 1.0], [0.0, 0.5, 1.0])]
 CELLS = cells_of(["CartPole-v1"], CURVES, range(5), 4, {"vf_steps": 2})
@@ -236,3 +239,36 @@ def test_runs_of_different_lengths_are_not_mixed(table: pd.DataFrame, tmp_path: 
 
 def test_rows_of_some_cells(table: pd.DataFrame) -> None:
     assert sorted(rows_of_cells(table, CELLS[:2])["trial"].unique()) == [0, 1]
+
+
+# --- Back into a sweep ---
+
+
+def test_exported_results_are_taken_in_and_nothing_is_run_again(table: pd.DataFrame, tmp_path: Path) -> None:
+    path = export(table, tmp_path / "results.csv")
+    study = SweepStudy("other", str(tmp_path / "other.journal"))
+    study.enqueue(CELLS[:2])  # one of them waits here, one is done here already
+    claim = study.claim(CELLS[:1])
+    assert claim is not None
+    claim.append([dict.fromkeys(COLUMNS, 1.0) | {"mean_return": 7.0}])
+    claim.complete(7.0)
+    read = read_results(path)
+    assert take_in(study, read) == len(CELLS) - 1
+    assert take_in(study, read) == 0
+
+    study.enqueue(CELLS)
+    assert study.claim(CELLS) is None
+    assert all(standing.status == Status.DONE for standing in study.standings().values())
+    results = results_of(SweepStudy("other", str(tmp_path / "other.journal"), create=False))
+    columns = [name for name in COLUMNS_OF_TABLE if name not in ("sweep", "trial")]
+    order = ["condition", "gamma", "gae_lambda", "seed", "iteration"]
+    others = [frame[frame["seed"] > 0].sort_values(order)[columns].reset_index(drop=True) for frame in (results, table)]
+    pd.testing.assert_frame_equal(*others)
+    assert results[results["mean_return"] == 7.0]["seed"].tolist() == [CELLS[0].seed]
+
+
+def test_runs_of_several_sweeps_are_kept_apart(table: pd.DataFrame, tmp_path: Path) -> None:
+    second = table.assign(sweep="second", seed=table["seed"] + 10)
+    study = SweepStudy("both", str(tmp_path / "both.journal"))
+    assert take_in(study, pd.concat([table, second])) == 2 * len(CELLS)
+    assert len(results_of(study)) == 2 * len(table)

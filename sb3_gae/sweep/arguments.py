@@ -36,6 +36,9 @@ def make_parser() -> argparse.ArgumentParser:
     exported = commands.add_parser("export", help="results as CSV and Parquet, a row for each seed and iteration")
     _add_study(exported)
     exported.add_argument("-o", "--output", nargs="+", help="files (default: logs/sweeps/NAME.csv and .parquet)")
+    taken_in = commands.add_parser("import", help="add the finished cells of exported files to a sweep")
+    taken_in.add_argument("files", nargs="+", metavar="FILE", help="CSV or Parquet")
+    _add_study(taken_in)
     _add_figure(commands.add_parser("figure", help="draw a figure from stored results"))
     _add_rank(commands.add_parser("rank", help="a table of the curves, the best first, with intervals"))
     return parser

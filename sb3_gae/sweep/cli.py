@@ -3,7 +3,7 @@
 import argparse
 import importlib.util
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -20,6 +20,7 @@ from sb3_gae.sweep.results import NO_PARQUET, read_results, results_of, select
 from sb3_gae.sweep.runner import check_plan, run_plan, standings_of
 from sb3_gae.sweep.storage import holds
 from sb3_gae.sweep.study import SweepStudy, default_location
+from sb3_gae.sweep.take_in import runs_of, take_in
 
 #: for the shell
 _FAILED_CELLS, _BAD_INPUT, _STOPPED = 1, 2, 130
@@ -32,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     args = make_parser().parse_args(arguments)
     try:
-        return {"run": _run, "status": _status, "export": _export, "figure": _figure, "rank": _rank}[args.command](args)
+        return _COMMANDS[args.command](args)
     except SweepError as error:
         print(f"sb3_gae.sweep: {error}", file=sys.stderr)
         return _BAD_INPUT
@@ -120,6 +121,14 @@ def _export(args: argparse.Namespace) -> int:
     return 0
 
 
+def _import(args: argparse.Namespace) -> int:
+    table = _read(args.files)
+    # An unknown --name begins a sweep
+    study = SweepStudy(_name_of(args), args.storage)
+    print(f"sweep {study.name!r}: {take_in(study, table)} of {len(list(runs_of(table)))} cells added, the others were there")
+    return 0
+
+
 def _figure(args: argparse.Namespace) -> int:
     table, name = _results_of(args)
     for path in draw(args.kind, table, args.output or f"logs/sweeps/{name}_{args.kind}", args.iteration, **selection_of(args)):
@@ -142,14 +151,30 @@ def _results_of(args: argparse.Namespace) -> tuple[pd.DataFrame, str]:
     if args.sources is not None:
         if args.storage is not None or args.name is not None or args.preset is not None:
             raise SweepError("`from` names files; leave out --storage, --name and --preset, or --from.")
-        tables = [read_results(source) for source in args.sources]
-        return pd.concat(tables, ignore_index=True), Path(args.sources[0]).name.split(".")[0]
+        return _read(args.sources), Path(args.sources[0]).name.split(".")[0]
     study = _study_of(args)
     return results_of(study), study.name
 
 
+def _read(files: Sequence[str]) -> pd.DataFrame:
+    return pd.concat([read_results(file) for file in files], ignore_index=True)
+
+
 def _study_of(args: argparse.Namespace) -> SweepStudy:
-    name = args.name or args.preset
-    if name is None:
-        raise SweepError("Which sweep? Give its --name, or the --preset it was made of.")
-    return SweepStudy(name, args.storage, create=False)
+    return SweepStudy(_name_of(args), args.storage, create=False)
+
+
+def _name_of(args: argparse.Namespace) -> str:
+    if name := args.name or args.preset:
+        return str(name)
+    raise SweepError("Which sweep? Give its --name, or the --preset it was made of.")
+
+
+_COMMANDS: dict[str, Callable[[argparse.Namespace], int]] = {
+    "run": _run,
+    "status": _status,
+    "export": _export,
+    "import": _import,
+    "figure": _figure,
+    "rank": _rank,
+}

@@ -21,8 +21,9 @@ _OF_THE_UPDATE = {
 }
 
 #: of a row: ``iteration`` from 1, ``timesteps`` since the start, ``episodes`` that ended in the batch with their
-#: ``mean_return`` and ``mean_length`` (steps), ``seconds`` of rollout and update; NaN where there is none
-COLUMNS = ("iteration", "timesteps", "episodes", "mean_return", "mean_length", "seconds", *_OF_THE_UPDATE)
+#: ``mean_return`` and ``mean_length`` (steps), ``lambda_used`` for their advantages, ``seconds`` of rollout and update;
+#: NaN where there is none
+COLUMNS = ("iteration", "timesteps", "episodes", "mean_return", "mean_length", "lambda_used", "seconds", *_OF_THE_UPDATE)
 
 Row = dict[str, float]
 
@@ -70,6 +71,7 @@ class Recorder(BaseCallback):
             "episodes": len(self._returns),
             "mean_return": float(np.mean(self._returns)) if self._returns else math.nan,
             "mean_length": float(np.mean(self._lengths)) if self._lengths else math.nan,
+            "lambda_used": float(self.model.gae_lambda),  # type: ignore[attr-defined]
         }
 
     def _on_training_end(self) -> None:

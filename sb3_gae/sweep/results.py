@@ -188,10 +188,14 @@ def rows_of_cells(table: pd.DataFrame, cells: Iterable[Cell]) -> pd.DataFrame:
     """
     trials = table.drop_duplicates("trial")
     keys = {cell.key for cell in cells}
-    own = [trial.trial for trial in trials.itertuples() if _cell_of(trial).key in keys]
+    own = [trial.trial for trial in trials.itertuples() if cell_of(trial).key in keys]
     return table[table["trial"].isin(own)].reset_index(drop=True)
 
 
-def _cell_of(row: Any) -> Cell:
+def cell_of(row: Any) -> Cell:
+    """
+    :param row: of a table of results
+    :return: the cell that it is of
+    """
     gae_lambda = None if math.isnan(row.gae_lambda) else row.gae_lambda
-    return Cell(row.task, row.condition, row.gamma, gae_lambda, row.seed, row.iterations, row.overrides)
+    return Cell(row.task, row.condition, row.gamma, gae_lambda, int(row.seed), int(row.iterations), row.overrides)

@@ -1,6 +1,8 @@
 """A sweep as an Optuna study: cells are trials, shared by every process that opens the same storage."""
 
 import contextlib
+import datetime
+import math
 import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -131,6 +133,27 @@ class SweepStudy:
             for trial in duplicates(self.trials()):
                 self._end(trial, Outcome.DUPLICATE, "another trial of the same cell counts")
 
+    def add_finished(self, cell: Cell, rows: Sequence[Mapping[str, float]], **what: Any) -> bool:
+        """
+        Take in a cell that was run elsewhere.
+
+        :param cell: that is done
+        :param rows: see :meth:`Claim.append`
+        :param what: see :meth:`Claim.describe`
+        :return: False if the cell was done here already, which stays as it is
+        """
+        standing = self.standings().get(cell.key)
+        if standing is not None and standing.status == Status.DONE:
+            return False
+        returns = {int(row["iteration"]): float(row["mean_return"]) for row in rows}
+        trial = _template(cell, 0 if standing is None else standing.attempt)
+        trial.state, trial.value, trial.intermediate_values = TrialState.COMPLETE, _last_return(returns.values()), returns
+        trial.datetime_start = trial.datetime_complete = datetime.datetime.now()
+        trial.user_attrs |= what | {_rows_name(0): _columns(rows)}
+        with self.errors():
+            self.storage.create_new_trial(self._study_id, trial)
+        return True
+
     def claim(self, cells: Iterable[Cell]) -> "Claim | None":
         """
         Take a cell that waits, which nobody else can take then; first see to those whose process is gone.
@@ -214,7 +237,7 @@ class Claim:
         """
         if not rows:
             return
-        self._set(f"rows:{self._n_chunks:05d}", {name: [row[name] for row in rows] for name in rows[0]})
+        self._set(_rows_name(self._n_chunks), _columns(rows))
         self._n_chunks += 1
         for row in rows:
             with self._own():
@@ -247,6 +270,20 @@ class Claim:
                 yield
         except UpdateFinishedTrialError as error:
             raise TakenOverError(str(error)) from error
+
+
+def _rows_name(chunk: int) -> str:
+    return f"rows:{chunk:05d}"
+
+
+def _columns(rows: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+def _last_return(returns: Iterable[float]) -> float:
+    """The last one that is a number; minus infinity if in no iteration an episode ended."""
+    known = [value for value in returns if not math.isnan(value)]
+    return known[-1] if known else -math.inf
 
 
 def default_location(name: str) -> str:
