@@ -1,8 +1,10 @@
 """
-Prints the table of docs/why-it-works.md: the error of the policy gradient if λ is chosen by what rollouts say of it.
+Prints the tables of docs/why-it-works.md: what becomes of the policy gradient if λ is chosen by what rollouts say of it.
 
     python docs/measured_lambda.py
 """
+
+from collections.abc import Callable
 
 import numpy as np
 from gridworld_figures import GAMMA, half_trained_policy, value_functions
@@ -10,12 +12,29 @@ from gridworld_figures import GAMMA, half_trained_policy, value_functions
 from sb3_gae.callbacks import PAPER_LAMBDAS
 from sb3_gae.gridworld import TabularPolicy, episode_advantages, episode_gradients, sample_episodes
 from sb3_gae.group_statistics import gradient_errors
+from sb3_gae.rollout_diagnostics import expected_improvement
 
 N_GROUPS, N_ROLLOUTS, AVERAGED = 10, 200, 10
 
+#: of quantities of shape (..., 4, L) in the order of :func:`exact`, shape (..., L); the larger the better
+CRITERIA: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "error": lambda of: -(np.maximum(of[..., 0, :], 0.0) + of[..., 1, :]),
+    "improvement": lambda of: expected_improvement(of[..., 3, :], of[..., 2, :] + of[..., 1, :]),
+}
+
+
+def exact(policy: TabularPolicy, values: np.ndarray, n_episodes: int) -> np.ndarray:
+    """:return: bias squared, variance, squared norm and product with the true gradient, for each λ, shape (4, L)"""
+    truth = policy.true_gradient(GAMMA)
+    moments = [policy.gradient_moments(values, GAMMA, gae_lambda) for gae_lambda in PAPER_LAMBDAS]
+    means, variances = np.stack([each.mean for each in moments]), np.array([each.variance for each in moments])
+    over = (1, 2)
+    norms, products = np.square(means).sum(axis=over), (means * truth).sum(axis=over)
+    return np.stack([np.square(means - truth).sum(axis=over), variances / n_episodes, norms, products])
+
 
 def measured(policy: TabularPolicy, values: np.ndarray, n_episodes: int, generator: np.random.Generator) -> np.ndarray:
-    """:return: bias squared and variance of each λ, estimated from one rollout, shape (2, L)"""
+    """:return: the same, estimated from one rollout"""
     episodes = sample_episodes(policy, n_episodes, generator)
     gradients = [
         episode_gradients(policy, episodes, episode_advantages(policy, episodes, values, GAMMA, gae_lambda))
@@ -23,40 +42,36 @@ def measured(policy: TabularPolicy, values: np.ndarray, n_episodes: int, generat
     ]
     size = n_episodes // N_GROUPS
     sums = np.stack(gradients, axis=1).reshape(N_GROUPS, size, len(PAPER_LAMBDAS), -1).sum(axis=1)
-    errors = gradient_errors(sums, np.full(N_GROUPS, size))
-    return np.stack([errors.bias_squared.value, errors.variance.value])
+    return np.stack([each.value for each in gradient_errors(sums, np.full(N_GROUPS, size))])
 
 
-def error_of_choice(estimates: np.ndarray, errors: np.ndarray) -> float:
+def table(criterion: str, policy: TabularPolicy, unit: Callable[[np.ndarray], float]) -> None:
     """
-    :param estimates: of independent choices, shape (n, 2, L)
-    :param errors: exact, shape (L,)
-    :return: mean of the exact error at the λ that each estimate would choose
+    :param criterion: a key of :data:`CRITERIA`
+    :param policy: on the gridworld
+    :param unit: of the numbers, given the merit of each λ
     """
-    chosen = (np.maximum(estimates[:, 0], 0.0) + estimates[:, 1]).argmin(axis=1)
-    return float(errors[chosen].mean())
-
-
-def main() -> None:
-    policy, generator = half_trained_policy(), np.random.default_rng(2)
-    norm = np.square(policy.true_gradient(GAMMA)).sum()
-    print(f"| V | episodes | best λ | its error | λ = 0.96 | λ = 1 | chosen by 1 rollout | by {AVERAGED} |")
+    merit, generator = CRITERIA[criterion], np.random.default_rng(2)
+    print(f"| V | episodes | best λ | its {criterion} | λ = 0.96 | λ = 1 | chosen by 1 rollout | by {AVERAGED} |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     for name, values in value_functions(policy).items():
         for n_episodes in (20, 200):
-            curve = policy.lambda_curve(values, GAMMA, PAPER_LAMBDAS)
-            errors = (curve.bias_squared + curve.variance / n_episodes) / norm
+            true = merit(exact(policy, values, n_episodes))
             estimates = np.stack([measured(policy, values, n_episodes, generator) for _ in range(N_ROLLOUTS)])
             averages = estimates.reshape(-1, AVERAGED, *estimates.shape[1:]).mean(axis=1)
-            numbers = [
-                errors.min(),
-                errors[PAPER_LAMBDAS.index(0.96)],
-                errors[-1],
-                error_of_choice(estimates, errors),
-                error_of_choice(averages, errors),
-            ]
+            chosen = [float(true[merit(each).argmax(axis=1)].mean()) for each in (estimates, averages)]
+            numbers = np.array([true.max(), true[PAPER_LAMBDAS.index(0.96)], true[-1], *chosen]) / unit(true)
             cells = " | ".join(f"{number:.2f}" for number in numbers)
-            print(f"| {name} | {n_episodes} | {PAPER_LAMBDAS[errors.argmin()]:g} | {cells} |")
+            print(f"| {name} | {n_episodes} | {PAPER_LAMBDAS[true.argmax()]:g} | {cells} |")
+
+
+def main() -> None:
+    policy = half_trained_policy()
+    norm = float(np.square(policy.true_gradient(GAMMA)).sum())
+    table("error", policy, lambda true: -norm)
+    print()
+    # A step along the true gradient gains its length
+    table("improvement", policy, lambda true: np.sqrt(norm))
 
 
 if __name__ == "__main__":

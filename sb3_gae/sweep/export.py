@@ -52,7 +52,7 @@ def _write(table: pd.DataFrame, path: Path) -> None:
         table.to_csv(path, index=False, lineterminator="\n")
         return
     try:
-        table.to_parquet(path, index=False)
+        table.to_parquet(path, index=False, compression="zstd")
     except ImportError:
         raise SweepError(NO_PARQUET) from None
 
