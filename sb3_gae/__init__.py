@@ -8,7 +8,7 @@ arXiv 1506.02438.
 from sb3_gae.callbacks import GradientDiagnosticsCallback, LambdaSweepCallback
 from sb3_gae.envs import register_tasks
 from sb3_gae.errors import NumericalError
-from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
 from sb3_gae.presets import CARTPOLE_NETWORKS, LOCOMOTION_NETWORKS, PAPER_VALUE_FIT
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer, LambdaSweep
 from sb3_gae.rollout_diagnostics import LambdaErrors
@@ -36,4 +36,5 @@ __all__ = [
     "MujocoVecEnv",
     "MultiInputPolicy",
     "NumericalError",
+    "SharedMlpPolicy",
 ]

@@ -1,5 +1,6 @@
 """Finds the MLPs inside an SB3 actor-critic policy, where there are such that :class:`DenseNetwork` can stand in for."""
 
+import itertools
 from collections.abc import Sequence
 
 import torch as th
@@ -36,7 +37,8 @@ def has_dense_value(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor]) 
     :param parameters: what the value step may move
     :return: whether that is exactly an MLP as SB3 builds it, on features that the step does not move
     """
-    return _inherits(policy, "predict_values", "extract_features") and _hold_exactly(_value_layers(policy), [], parameters)
+    _, layers = _value_layers(policy, parameters)
+    return _inherits(policy, "predict_values", "extract_features") and _hold_exactly(layers, [], parameters)
 
 
 def gaussian_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
@@ -64,13 +66,19 @@ def dense_policy_network(policy: ActorCriticPolicy, observations: PyTorchObs) ->
     return DenseNetwork(_policy_layers(policy), _features(policy, observations, policy.pi_features_extractor))
 
 
-def dense_value_network(policy: ActorCriticPolicy, observations: PyTorchObs) -> DenseNetwork:
+def dense_value_network(
+    policy: ActorCriticPolicy, observations: PyTorchObs, parameters: Sequence[th.Tensor] | None = None
+) -> DenseNetwork:
     """
     :param policy: one that :func:`has_dense_value`
     :param observations: B samples
-    :return: the network from features to the value, without the factor of a :class:`ValueHead`
+    :param parameters: what the value step may move, None for all
+    :return: the network from features to the value, without the factor of a :class:`ValueHead`; layers that are the
+        policy's as well and do not move belong to the features
     """
-    return DenseNetwork(_value_layers(policy), _features(policy, observations, policy.vf_features_extractor))
+    fixed, layers = _value_layers(policy, parameters)
+    features = _features(policy, observations, policy.vf_features_extractor)
+    return DenseNetwork(layers, in_chunks(nn.Sequential(*fixed), features) if fixed else features)
 
 
 def policy_log_std(policy: ActorCriticPolicy) -> list[th.Tensor]:
@@ -85,10 +93,18 @@ def _policy_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
     return _layers(policy, "policy_net", policy.action_net)
 
 
-def _value_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
+def _value_layers(
+    policy: ActorCriticPolicy, parameters: Sequence[th.Tensor] | None
+) -> tuple[list[nn.Module], list[nn.Module]]:
+    """The first layers, if they are the policy's as well and hold none of the parameters, and the rest."""
     head = policy.value_net
     # A subclass may do more than scale: it stays as it is, and so is refused
-    return _layers(policy, "value_net", head.unscaled() if type(head) is ValueHead else head)
+    layers = _layers(policy, "value_net", head.unscaled() if type(head) is ValueHead else head)
+    of_policy, moved = set(_policy_layers(policy)), {id(parameter) for parameter in parameters or ()}
+    fixed = list(itertools.takewhile(of_policy.__contains__, layers)) if parameters is not None else []
+    if any(id(parameter) in moved for layer in fixed for parameter in layer.parameters()):
+        fixed = []
+    return fixed, layers[len(fixed) :]
 
 
 def _layers(policy: ActorCriticPolicy, body: str, head: nn.Module) -> list[nn.Module]:

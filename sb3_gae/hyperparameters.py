@@ -67,7 +67,8 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
         check_number(name, values[name], 0.0, above=True, below=True)
     for name in ("cg_damping", "vf_cg_damping"):
         check_number(name, values[name], 0.0, below=True)
-    check_number("cg_tolerance", values["cg_tolerance"], 0.0, 1.0, below=True)
+    for name in ("cg_tolerance", "vf_kl_fraction"):
+        check_number(name, values[name], 0.0, 1.0, below=True)
     check_number("line_search_shrinking_factor", values["line_search_shrinking_factor"], 0.0, 1.0, above=True, below=True)
     for name in ("n_steps", "cg_max_steps", "vf_cg_max_steps", "line_search_max_iter", "sub_sampling_factor", "batch_size"):
         check_count(name, values[name])
@@ -85,10 +86,22 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
             "`baseline` = 'time' has neither a value function to fit first nor a lambda to choose; leave out "
             "`value_fit_first`, and give `gae_lambda` a number or nothing."
         )
+    _check_vf_kl_fraction(values)
     _check_batch(values["n_steps"], values["n_envs"], values["sub_sampling_factor"], values["n_episodes"])
     _check_buffer_class(values["rollout_buffer_class"])
     if "value_lambda" in values["rollout_buffer_kwargs"]:
         raise ValueError("Pass `value_lambda` to TRPOGAE itself and not in `rollout_buffer_kwargs`.")
+
+
+def _check_vf_kl_fraction(values: Mapping[str, Any]) -> None:
+    if values["vf_kl_fraction"] == 0.0:
+        return
+    for name, value in (("vf_optimizer", "trust_region"), ("baseline", "value"), ("value_fit_first", False)):
+        if values[name] != value:
+            raise ValueError(
+                f"`vf_kl_fraction` = {values['vf_kl_fraction']!r} is for a value fit by trust region after the policy step; "
+                f"set it to 0, or leave out `{name}` = {values[name]!r}."
+            )
 
 
 def _check_batch(n_steps: int, n_envs: int, sub_sampling_factor: int, n_episodes: int | None) -> None:

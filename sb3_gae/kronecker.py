@@ -6,9 +6,18 @@ The block of the curvature that belongs to one layer is about :math:`A \otimes G
 the approximation costs no accuracy. It decides how fast conjugate gradient converges, and not what it converges to.
 """
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import torch as th
+from torch import nn
 
 from sb3_gae.dense_network import DenseNetwork
+
+#: second moments of cotangents at the outputs of linear layers, shapes (n_out, n_out)
+OutputMoments = Mapping[nn.Module, th.Tensor]
+
+NOTHING_ADDED: OutputMoments = MappingProxyType({})
 
 # Eigendecompositions grow with the cube of a layer's width; above this they cost more than the products that they save
 _WIDEST_LAYER = 512
@@ -20,11 +29,16 @@ class KroneckerPreconditioner:
 
     :param network: after :meth:`DenseNetwork.forward`
     :param cotangents: one for each output, whose covariance is the output metric, shape (B, n_out)
+    :param added: second moments of further cotangents at the outputs of some layers, where the curvature of another
+        network with these layers is added: both have the same inputs, so that the sum is a Kronecker product again
     """
 
-    def __init__(self, network: DenseNetwork, cotangents: th.Tensor):
+    def __init__(self, network: DenseNetwork, cotangents: th.Tensor, added: OutputMoments = NOTHING_ADDED):
         self._layers = [linear for linear, _ in network.layers]
-        self._eigen = [(_eigh(inputs), _eigh(outputs)) for inputs, outputs in network.kronecker_factors(cotangents)]
+        self._eigen = [
+            (_eigh(inputs), _eigh(outputs + added[layer] if layer in added else outputs))
+            for layer, (inputs, outputs) in zip(self._layers, network.kronecker_factors(cotangents), strict=True)
+        ]
 
     @staticmethod
     def suits(network: DenseNetwork) -> bool:

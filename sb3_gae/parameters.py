@@ -69,3 +69,18 @@ def unflatten(parameters: Iterable[th.Tensor], vector: th.Tensor) -> Iterator[tu
         end = start + parameter.numel()
         yield parameter, vector[start:end].view_as(parameter)
         start = end
+
+
+def positions(parameters: Iterable[th.Tensor], some: Iterable[th.Tensor]) -> th.Tensor:
+    """
+    Where some of the parameters are in the flat vector of all.
+
+    :param parameters: in the order of the vector
+    :param some: of these
+    :return: indices in the order of ``some``, shape (m,), m the number of scalars in them
+    """
+    starts, start = {}, 0
+    for parameter in parameters:
+        starts[id(parameter)] = start
+        start += parameter.numel()
+    return th.cat([th.arange(parameter.numel(), device=parameter.device) + starts[id(parameter)] for parameter in some])

@@ -13,7 +13,7 @@ from sb3_gae.batch import TrainingBatch
 from sb3_gae.curvature import CurvatureProduct, hessian_product
 from sb3_gae.dense_policy import dense_policy_network, has_dense_policy, policy_log_std
 from sb3_gae.distributions import distribution_from_outputs, fisher_metric, mean_kl, snapshot
-from sb3_gae.kronecker import KroneckerPreconditioner
+from sb3_gae.kronecker import KroneckerPreconditioner, OutputMoments
 from sb3_gae.parameters import flat_gradient, influencing_parameters
 from sb3_gae.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
 
@@ -159,14 +159,20 @@ class DenseFisher:
 
     def __init__(self, policy: ActorCriticPolicy, observations: PyTorchObs):
         self._network = dense_policy_network(policy, observations)
+        self._log_std = policy_log_std(policy)
         self._outputs = self._network.forward().requires_grad_()
-        self._distribution = snapshot(distribution_from_outputs(policy.action_dist, self._outputs, policy_log_std(policy)))
+        self._distribution = snapshot(distribution_from_outputs(policy.action_dist, self._outputs, self._log_std))
         self._preconditioner: KroneckerPreconditioner | None = None
         with th.no_grad():
-            old = snapshot(distribution_from_outputs(policy.action_dist, self._outputs, policy_log_std(policy)))
+            old = snapshot(distribution_from_outputs(policy.action_dist, self._outputs, self._log_std))
         self._metric = fisher_metric(old)
         #: in the order of vectors
         self.parameters: list[th.Tensor] = [*self._network.parameters, *policy_log_std(policy)]
+
+    @property
+    def parameters(self) -> list[th.Tensor]:
+        """In the order of the vectors."""
+        return [*self._network.parameters, *self._log_std]
 
     def product(self, vector: th.Tensor) -> th.Tensor:
         """
@@ -187,9 +193,20 @@ class DenseFisher:
         """
         if not KroneckerPreconditioner.suits(self._network):
             return False
-        (scores,) = th.autograd.grad(self._distribution.log_prob(actions).sum(), self._outputs)
-        self._preconditioner = KroneckerPreconditioner(self._network, scores)
+        self._preconditioner = KroneckerPreconditioner(self._network, self._scores(actions))
         return True
+
+    def output_moments(self, actions: th.Tensor) -> OutputMoments:
+        """
+        :param actions: as for :meth:`prepare`
+        :return: for each linear layer the second moment of the scores at its output, shape (n_out, n_out)
+        """
+        factors = self._network.kronecker_factors(self._scores(actions))
+        return {linear: outputs for (linear, _), (_, outputs) in zip(self._network.layers, factors, strict=True)}
+
+    def _scores(self, actions: th.Tensor) -> th.Tensor:
+        (scores,) = th.autograd.grad(self._distribution.log_prob(actions).sum(), self._outputs)
+        return scores
 
     def precondition(self, vector: th.Tensor, damping: float) -> th.Tensor:
         """

@@ -34,10 +34,11 @@ from sb3_gae.collection import (
 from sb3_gae.episode_quota import EpisodeQuota
 from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
 from sb3_gae.lambda_rules import LambdaRule, lambda_rule
-from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
 from sb3_gae.policy_step import policy_parameters, policy_step
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
 from sb3_gae.saved_model import SavedModel
+from sb3_gae.shared_features import ParameterGroups, SharedParameters, policy_step_radius, shared_parameters
 from sb3_gae.threads import threads_for_steps
 from sb3_gae.time_baseline import TimeBaseline
 from sb3_gae.trust_region import StepRecord, TrustRegionSettings
@@ -57,7 +58,7 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
     takes the mean over them. Each iteration computes the advantages with the value function that the rollout was
     collected with, then steps the policy, and fits the value function last.
 
-    :param policy: ``MlpPolicy``, ``CnnPolicy``, ``MultiInputPolicy``, or a class
+    :param policy: ``MlpPolicy``, ``SharedMlpPolicy``, ``CnnPolicy``, ``MultiInputPolicy``, or a class
     :param env: the environment to learn from (if registered in Gym, can be str)
     :param learning_rate: of Adam; read only with ``vf_optimizer="adam"`` (default: 1e-3)
     :param n_steps: steps of each environment in a rollout; the batch is ``n_steps * n_envs``
@@ -94,6 +95,10 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
     :param vf_steps: largest number of value steps a rollout
     :param vf_cg_max_steps: largest number of conjugate-gradient steps for a value step
     :param vf_cg_damping: added to the diagonal of the Gauss-Newton matrix over :math:`\sigma^2` while solving
+    :param vf_kl_fraction: part of ``target_kl`` by which the value fit of an iteration may move the policy, through
+        parameters that both depend on. The policy step then keeps to :math:`(1 - \sqrt f)^2` of ``target_kl``, so that both
+        together stay about within it. 0 leaves these parameters to the policy step alone, and without such parameters the
+        argument has no effect
     :param cg_tolerance: conjugate gradient ends when a step adds less than this part of what all have added,
         for policy and value function; 0 runs to the largest number of steps or to convergence
     :param vf_optimizer: ``"trust_region"``, or ``"adam"`` for the fit of sb3-contrib's TRPO
@@ -117,6 +122,7 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         "MlpPolicy": MlpPolicy,
         "CnnPolicy": CnnPolicy,
         "MultiInputPolicy": MultiInputPolicy,
+        "SharedMlpPolicy": SharedMlpPolicy,
     }
     rollout_buffer: GAERolloutBuffer
 
@@ -154,6 +160,7 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         vf_steps: int = 5,
         vf_cg_max_steps: int = 10,
         vf_cg_damping: float = 1e-2,
+        vf_kl_fraction: float = 0.0,
         cg_tolerance: float = 0.1,
         vf_optimizer: str = "trust_region",
         normalize_value: bool = True,
@@ -202,6 +209,7 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         self.vf_steps = vf_steps
         self.vf_cg_max_steps = vf_cg_max_steps
         self.vf_cg_damping = vf_cg_damping
+        self.vf_kl_fraction = vf_kl_fraction
         self.cg_tolerance = cg_tolerance
         self.vf_optimizer = vf_optimizer
         self.normalize_value = normalize_value
@@ -372,28 +380,32 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
         batch = training_batch(self.rollout_buffer, self.action_space)
-        of_policy = policy_parameters(self.policy, batch)
-        of_value = value_parameters(self.policy, batch, of_policy)
-        if not of_policy:
+        parameters = self._parameter_groups(batch)
+        if not parameters.of_policy:
             raise ValueError("The action distribution depends on no trainable parameter; give the policy layers.")
         with all_or_nothing(self.policy):
             if self.value_fit_first:
-                value_record = self._fit_value(batch, of_value)
+                value_record = self._fit_value(batch, parameters)
                 self._estimate_advantages(self.rollout_buffer)
-                policy_record = self._step_policy(training_batch(self.rollout_buffer, self.action_space), of_policy)
+                policy_record = self._step_policy(training_batch(self.rollout_buffer, self.action_space), parameters)
             else:
-                policy_record = self._step_policy(batch, of_policy)
-                value_record = self._fit_value(batch, of_value)
+                policy_record = self._step_policy(batch, parameters)
+                value_record = self._fit_value(batch, parameters)
         self._n_updates += 1
         self._log_update(policy_record, value_record, batch.value_targets)
 
-    def _step_policy(self, batch: TrainingBatch, parameters: list[th.Tensor]) -> StepRecord:
+    def _parameter_groups(self, batch: TrainingBatch) -> ParameterGroups:
+        of_policy = policy_parameters(self.policy, batch)
+        of_both = shared_parameters(self.policy, batch, of_policy) if self.vf_kl_fraction > 0.0 else []
+        return ParameterGroups(of_policy, value_parameters(self.policy, batch, of_policy), of_both)
+
+    def _step_policy(self, batch: TrainingBatch, parameters: ParameterGroups) -> StepRecord:
         advantages = standardized(batch.advantages) if self.normalize_advantage else batch.advantages
         if self.sub_sampling_factor > 1:
             subset = random_subset(len(batch), max(2, len(batch) // self.sub_sampling_factor), self.device)
             batch, advantages = batch.take(subset), advantages[subset]  # type: ignore[arg-type]
         settings = TrustRegionSettings(
-            radius=self.target_kl,
+            radius=policy_step_radius(self.target_kl, self.vf_kl_fraction) if parameters.of_both else self.target_kl,
             cg_max_steps=self.cg_max_steps,
             cg_damping=self.cg_damping,
             cg_progress_tolerance=self.cg_tolerance,
@@ -401,19 +413,19 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
             max_trials=self.line_search_max_iter,
         )
         curvature_subset = random_subset(len(batch), self.curvature_samples, self.device)
-        return policy_step(self.policy, parameters, batch, advantages, settings, curvature_subset)
+        return policy_step(self.policy, parameters.of_policy, batch, advantages, settings, curvature_subset)
 
-    def _fit_value(self, batch: TrainingBatch, parameters: list[th.Tensor]) -> ValueFitRecord:
+    def _fit_value(self, batch: TrainingBatch, parameters: ParameterGroups) -> ValueFitRecord:
         if self.baseline == "time":
             values = th.as_tensor(self.rollout_buffer.values[self.rollout_buffer.mask])
             return ValueFitRecord([], values, values)
         head = self._value_head()
         # A head that is frozen, or that the policy depends on as well, keeps its bits
-        movable = {id(parameter) for parameter in parameters}
+        movable = {id(parameter) for parameter in parameters.of_value}
         if head is not None and all(id(parameter) in movable for parameter in head.parameters()):
             head.update_scale(batch.value_targets)
         if self.vf_optimizer == "adam":
-            return adam_fit(self.policy, parameters, self.rollout_buffer, self.n_critic_updates, self.batch_size)
+            return adam_fit(self.policy, parameters.of_value, self.rollout_buffer, self.n_critic_updates, self.batch_size)
         settings = TrustRegionSettings(
             radius=self.vf_trust_region,
             cg_max_steps=self.vf_cg_max_steps,
@@ -424,7 +436,9 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
             max_scale=1.0,
         )
         curvature_subset = random_subset(len(batch), self.curvature_samples, self.device)
-        return value_steps(self.policy, parameters, batch, settings, self.vf_steps, curvature_subset)
+        limit = self.vf_kl_fraction * self.target_kl
+        shared = SharedParameters(self.policy, parameters, batch, limit, curvature_subset) if parameters.of_both else None
+        return value_steps(self.policy, parameters.of_value, batch, settings, self.vf_steps, curvature_subset, shared)
 
     def _log_update(self, policy_record: StepRecord, value_record: ValueFitRecord, value_targets: th.Tensor) -> None:
         for name, value in update_summary(policy_record, value_record, value_targets).items():

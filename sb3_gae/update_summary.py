@@ -13,7 +13,8 @@ def update_summary(policy_record: StepRecord, value_record: ValueFitRecord, valu
     :param policy_record: of the policy step
     :param value_record: of the value fit
     :param value_targets: of the value fit, shape (B,)
-    :return: sb3-contrib's names where it has one; the ``vf_`` entries only after trust-region steps
+    :return: sb3-contrib's names where it has one; the ``vf_`` entries only after trust-region steps, and
+        ``vf_policy_kl`` only where these may have moved the policy
     """
     # Double precision: squares of values around 1e30 leave the range of single
     tensors = (value_record.values_before, value_record.values_after, value_targets)
@@ -32,4 +33,6 @@ def update_summary(policy_record: StepRecord, value_record: ValueFitRecord, valu
         summary["vf_steps"] = sum(step.accepted for step in value_record.steps)
         summary["vf_kl_divergence"] = max(step.divergence for step in value_record.steps)
         summary["vf_cg_steps"] = sum(step.cg_steps for step in value_record.steps)
+    if value_record.policy_kl is not None:
+        summary["vf_policy_kl"] = value_record.policy_kl
     return summary

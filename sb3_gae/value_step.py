@@ -19,8 +19,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_gae.batch import TrainingBatch, in_chunks, take
 from sb3_gae.curvature import CurvatureProduct, hessian_product
 from sb3_gae.dense_policy import dense_value_network, has_dense_value
-from sb3_gae.kronecker import KroneckerPreconditioner
+from sb3_gae.kronecker import NOTHING_ADDED, KroneckerPreconditioner, OutputMoments
 from sb3_gae.parameters import flat_gradient, influencing_parameters
+from sb3_gae.shared_features import SharedParameters, SharedStep
 from sb3_gae.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
 from sb3_gae.value_head import ValueHead
 
@@ -46,11 +47,13 @@ class ValueFitRecord:
     :param steps: a record for each step; their objectives are in units of each step's own :math:`\sigma^2`
     :param values_before: values of the batch before the first step, in units of the reward, shape (B,)
     :param values_after: values of the batch after the last step, in units of the reward, shape (B,)
+    :param policy_kl: how far the policy was moved by the parameters that it shares; None where they were left alone
     """
 
     steps: list[StepRecord]
     values_before: th.Tensor
     values_after: th.Tensor
+    policy_kl: float | None = None
 
 
 def value_steps(
@@ -60,12 +63,14 @@ def value_steps(
     settings: TrustRegionSettings,
     n_steps: int,
     curvature_subset: th.Tensor | None = None,
+    shared: SharedParameters | None = None,
 ) -> ValueFitRecord:
     r"""
     Fit the value function by up to ``n_steps`` trust-region steps, each measured from where it begins.
 
     Each solves the paper's problem (section 5) once, with :math:`V_{old}` and :math:`\sigma^2` taken anew.
-    The first step that is rejected is the last.
+    The first step that is rejected is the last. With shared parameters it is the last that moves those, as is one that
+    leaves no room: the value function's own may go on.
 
     :param policy: owner of the value function, in evaluation mode
     :param parameters: see :func:`value_parameters`
@@ -73,22 +78,34 @@ def value_steps(
     :param settings: radius, solver and search
     :param n_steps: largest number of steps
     :param curvature_subset: samples to compute the curvature on, None for all
+    :param shared: what is to be moved beside the parameters, within which limit; None for nothing
     :return: what was done
     :raises NumericalError: if a gradient or a curvature product is not finite
     """
     observations = batch.observations if curvature_subset is None else take(batch.observations, curvature_subset)
-    make_model = _DenseValues if has_dense_value(policy, parameters) else _AutogradValues
     scale = value_scale(policy)
-    fit = _Fit(make_model(policy, parameters, batch.observations, observations), batch.value_targets / scale)
+
+    def make_fit(moved: Sequence[th.Tensor]) -> _Fit:
+        make_model = _DenseValues if has_dense_value(policy, moved) else _AutogradValues
+        return _Fit(make_model(policy, moved, batch.observations, observations), batch.value_targets / scale)
+
+    joint = shared
+    fit = make_fit(parameters if joint is None else [*parameters, *joint.parameters])
     settings = replace(settings, cg_damping=settings.cg_damping / fit.target_square)
-    before, records = fit.values, []
-    for _ in range(n_steps if parameters else 0):
-        if fit.variance == 0.0:
+    before = fit.values
+    records: list[StepRecord] = []
+    for steps_left in range(n_steps, 0, -1):
+        radius = 0.0 if joint is None else joint.radius(steps_left)
+        rejected = bool(records) and not records[-1].accepted
+        if joint is not None and (rejected or radius == 0.0):
+            joint, fit = None, make_fit(parameters)
+        elif rejected:
             break
-        records.append(fit.step(settings))
-        if not records[-1].accepted:
+        if fit.variance == 0.0 or not fit.parameters:
             break
-    return ValueFitRecord(records, before * scale, fit.values * scale)
+        records.append(fit.step(settings) if joint is None else fit.step(settings, joint.step(fit.parameters, radius)))
+    policy_kl = None if shared is None else shared.divergence()
+    return ValueFitRecord(records, before * scale, fit.values * scale, policy_kl)
 
 
 def value_scale(policy: ActorCriticPolicy) -> th.Tensor | float:
@@ -111,10 +128,10 @@ class _Values(Protocol):
     def vjp(self, cotangents: th.Tensor) -> th.Tensor:
         """Jacobian's transpose at the parameters of the last :meth:`values`, times ``cotangents`` (B,), shape (n,)."""
 
-    def curvature(self) -> tuple[CurvatureProduct, KroneckerPreconditioner | None]:
+    def curvature(self, added: OutputMoments | None) -> tuple[CurvatureProduct, KroneckerPreconditioner | None]:
         """
         Products with the mean of the Jacobian's outer products over the curvature's samples, at the same parameters,
-        and about the inverse of that matrix where it is known.
+        and about the inverse of that matrix with what is ``added`` to it, where that is known.
         """
 
 
@@ -128,10 +145,10 @@ class _DenseValues:
         observations: PyTorchObs,
         curvature_observations: PyTorchObs,
     ):
-        self._network = dense_value_network(policy, observations)
+        self._network = dense_value_network(policy, observations, parameters)
         self._curvature_network = self._network
         if curvature_observations is not observations:
-            self._curvature_network = dense_value_network(policy, curvature_observations)
+            self._curvature_network = dense_value_network(policy, curvature_observations, parameters)
         self.parameters: Sequence[th.Tensor] = self._network.parameters
 
     def values(self) -> th.Tensor:
@@ -140,7 +157,7 @@ class _DenseValues:
     def vjp(self, cotangents: th.Tensor) -> th.Tensor:
         return self._network.vjp(cotangents[:, None])
 
-    def curvature(self) -> tuple[CurvatureProduct, KroneckerPreconditioner | None]:
+    def curvature(self, added: OutputMoments | None) -> tuple[CurvatureProduct, KroneckerPreconditioner | None]:
         network = self._curvature_network
         if network is not self._network:
             network.forward()
@@ -148,9 +165,9 @@ class _DenseValues:
         def product(vector: th.Tensor) -> th.Tensor:
             return network.gauss_newton_product(vector, lambda tangents, rows: tangents) / network.batch_size
 
-        if not KroneckerPreconditioner.suits(network):
+        if added is None or not KroneckerPreconditioner.suits(network):
             return product, None
-        return product, KroneckerPreconditioner(network, self.parameters[0].new_ones(network.batch_size, 1))
+        return product, KroneckerPreconditioner(network, self.parameters[0].new_ones(network.batch_size, 1), added)
 
 
 class _AutogradValues:
@@ -174,7 +191,7 @@ class _AutogradValues:
     def vjp(self, cotangents: th.Tensor) -> th.Tensor:
         return flat_gradient(self._predict(self._observations).dot(cotangents), self.parameters)
 
-    def curvature(self) -> tuple[CurvatureProduct, KroneckerPreconditioner | None]:
+    def curvature(self, added: OutputMoments | None) -> tuple[CurvatureProduct, KroneckerPreconditioner | None]:
         values = self._predict(self._curvature_observations)
         return hessian_product(0.5 * (values - values.detach()).square().mean(), self.parameters), None
 
@@ -191,6 +208,11 @@ class _Fit:
         self.values = model.values()
 
     @property
+    def parameters(self) -> Sequence[th.Tensor]:
+        """What a step moves."""
+        return self._model.parameters
+
+    @property
     def target_square(self) -> float:
         """
         Mean square of the targets, in the network's units: about 1 with a :class:`ValueHead` that keeps to the returns.
@@ -204,17 +226,22 @@ class _Fit:
         r""":math:`\sigma^2` of the present values, in units of the squared value scale."""
         return (self.values - self._targets).square().mean().item()
 
-    def step(self, settings: TrustRegionSettings) -> StepRecord:
+    def step(self, settings: TrustRegionSettings, shared: SharedStep | None = None) -> StepRecord:
         """One trust-region step from the present values."""
-        before = self.values
-        record = trust_region_step(self._local_problem(), settings)
+        before, constraint = self.values, None
+        added: OutputMoments | None = NOTHING_ADDED
+        if shared is not None:
+            constraint = shared.constraint
+            # To the curvature before its division by the variance
+            added = shared.output_moments(constraint.weight(settings.radius) * self.variance)
+        record = trust_region_step(replace(self._local_problem(added), constraint=constraint), settings)
         if not record.accepted:
             self.values = before
         return record
 
-    def _local_problem(self) -> LocalProblem:
+    def _local_problem(self, added: OutputMoments | None) -> LocalProblem:
         old_values, variance = self.values, self.variance
-        product, preconditioner = self._model.curvature()
+        product, preconditioner = self._model.curvature(added)
 
         def evaluate() -> tuple[float, float]:
             self.values = self._model.values()

@@ -330,6 +330,7 @@ def test_a_trial_that_torch_refuses_is_a_trial_that_failed() -> None:
         *[(name, value) for name in ("vf_steps", "n_critic_updates") for value in (-1, 1.5)],
         *[("batch_size", value) for value in (0, 1.5)],
         *[("curvature_samples", value) for value in (0, 1, 2.5)],
+        *[("vf_kl_fraction", value) for value in (-0.1, 1.0, math.nan, "0.1", True, None)],
         *[("vf_optimizer", value) for value in ("Adam", "sgd", None)],
     ],
 )
@@ -347,6 +348,7 @@ def test_an_argument_outside_its_domain_is_refused_by_name(name: str, value: Any
         *[("cg_damping", 0.0), ("vf_cg_damping", 0.0), ("curvature_samples", None), ("curvature_samples", 2)],
         *[("target_kl", 1e-12), ("target_kl", 100.0), ("vf_trust_region", 1e-12), ("vf_trust_region", 100.0)],
         *[("cg_max_steps", 1), ("vf_cg_max_steps", np.int64(1)), ("line_search_max_iter", 1), ("vf_steps", 0)],
+        *[("vf_kl_fraction", value) for value in (0, 1e-12, np.float32(0.99))],
     ],
 )
 def test_the_edges_of_a_domain_are_inside_and_train(name: str, value: Any) -> None:

@@ -1,5 +1,7 @@
 """Curvature products, dense and by autograd, against matrices from the definition of the Fisher information."""
 
+from typing import Any
+
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -18,7 +20,7 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from sb3_gae import MlpPolicy, dense_network
+from sb3_gae import MlpPolicy, SharedMlpPolicy, dense_network
 from sb3_gae.conjugate_gradient import conjugate_gradient
 from sb3_gae.curvature import CurvatureProduct, hessian_product
 from sb3_gae.dense_policy import dense_policy_network, dense_value_network, has_dense_policy, has_dense_value, policy_log_std
@@ -26,6 +28,7 @@ from sb3_gae.distributions import fisher_metric, mean_kl, snapshot
 from sb3_gae.kronecker import KroneckerPreconditioner
 from sb3_gae.parameters import assign, flatten
 from sb3_gae.policy_step import DenseFisher, autograd_fisher_product, policy_parameters
+from sb3_gae.shared_features import shared_parameters
 from sb3_gae.value_step import value_parameters
 
 N_SAMPLES = 7
@@ -253,6 +256,23 @@ def test_values_on_shared_convolutional_features_are_dense_and_agree_with_autogr
     )
     autograd = dense_matrix(value_curvature(policy, batch.observations, network.parameters), size_of(parameters))
     th.testing.assert_close(dense, autograd, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("net_arch", [[5, 4], dict(pi=[5, 4], vf=[5, 3])], ids=str)
+def test_layers_that_the_policy_shares_are_features_to_the_value_step_unless_it_moves_them(net_arch: Any) -> None:
+    policy = double_policy(ACTION_SPACES["Box"], policy_class=SharedMlpPolicy, net_arch=net_arch)
+    batch = training_batch(policy, N_SAMPLES)
+    of_policy = policy_parameters(policy, batch)
+    own = value_parameters(policy, batch, of_policy)
+    shared = shared_parameters(policy, batch, of_policy)
+    assert has_dense_policy(policy, of_policy)
+    for moved in (own, [*own, *shared]):
+        assert has_dense_value(policy, moved)
+        network = dense_value_network(policy, batch.observations, moved)
+        assert {id(parameter) for parameter in network.parameters} == {id(parameter) for parameter in moved}
+        th.testing.assert_close(network.forward(), policy.predict_values(batch.observations).detach())
+    # A part of the layers that move is no case for it
+    assert not has_dense_value(policy, [*own, shared[0]])
 
 
 def test_values_on_features_of_their_own_fall_back() -> None:

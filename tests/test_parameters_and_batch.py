@@ -8,7 +8,7 @@ from torch import nn
 
 from sb3_gae import batch as batch_module
 from sb3_gae.batch import TrainingBatch, batch_size, in_chunks, random_subset, standardized, take
-from sb3_gae.parameters import assign, flat_gradient, flatten, influencing_parameters, unflatten
+from sb3_gae.parameters import assign, flat_gradient, flatten, influencing_parameters, positions, unflatten
 
 # --- Parameters ---
 
@@ -60,6 +60,15 @@ def test_unflatten_gives_views_in_the_shapes_of_the_parameters() -> None:
         assert parameter.shape == piece.shape
         piece.add_(1.0)
     assert vector.tolist() == list(range(1, 10))
+
+
+def test_positions_are_where_the_values_of_some_are_in_the_vector_of_all() -> None:
+    everything = shapes()
+    some = [everything[3], everything[2], everything[0]]
+    assert flatten(everything)[positions(everything, some)].tolist() == flatten(some).tolist()
+    # Which tensor it is decides, and not what it holds
+    twins = [th.zeros(2), th.zeros(2)]
+    assert positions(twins, [twins[1]]).tolist() == [2, 3]
 
 
 def test_flat_gradient_is_zero_where_there_is_no_dependence() -> None:

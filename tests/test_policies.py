@@ -118,6 +118,7 @@ POLICIES: dict[str, tuple[Any, dict[str, Any]]] = {
     "extractor shared, class of SB3": (ActorCriticPolicy, SMALL | {"features_extractor_class": OwnExtractor}),
     "misleading names": (MisleadingNames, {}),
     "shared layers": (SharedLayers, {}),
+    "shared MLP": ("SharedMlpPolicy", SMALL),
     "values of its own": (OwnValues, SMALL),
 }
 

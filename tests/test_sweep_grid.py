@@ -54,6 +54,8 @@ def test_seeds_are_outermost_and_overrides_have_no_order() -> None:
         ("adam", {"vf_optimizer": "adam"}),
         ("mc_targets", {"value_lambda": 1.0}),
         ("lambda_targets", {"value_lambda": None}),
+        ("shared_frozen", {"policy": "SharedMlpPolicy", "vf_kl_fraction": 0.0}),
+        ("shared_joint", {"policy": "SharedMlpPolicy", "vf_kl_fraction": 0.01}),
     ],
 )
 def test_conditions_are_arguments(condition: str, settings: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ from oracles import ACTION_SPACES, OF_IMAGES, double_policy, jacobian, moved, st
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_gae import NumericalError, value_step
+from sb3_gae import NumericalError, SharedMlpPolicy, value_step
 from sb3_gae.batch import TrainingBatch, take
 from sb3_gae.parameters import flatten
 from sb3_gae.policy_step import policy_parameters
@@ -27,6 +27,7 @@ KINDS = {
     "shared convolution": OF_IMAGES,
     "own convolution": {**OF_IMAGES, "share_features_extractor": False},
     "gSDE": dict(use_sde=True),
+    "first layer shared": dict(policy_class=SharedMlpPolicy, net_arch=dict(pi=[5], vf=[5, 4])),
 }
 each_kind = pytest.mark.parametrize("kwargs", KINDS.values(), ids=KINDS.keys())
 

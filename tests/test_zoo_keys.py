@@ -16,7 +16,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor, load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize, is_vecenv_wrapped
 
-from sb3_gae import EnvPoolVecEnv, MujocoVecEnv, zoo
+from sb3_gae import EnvPoolVecEnv, MujocoVecEnv, SharedMlpPolicy, zoo
 
 TASK, ORDINARY = "GaeCartPole-v0", "CartPole-v1"
 SETTINGS = {"n_timesteps": 64, "policy": "MlpPolicy", "n_envs": 2, "n_steps": 16, "policy_kwargs": "dict(net_arch=[8])"}
@@ -171,6 +171,14 @@ def test_registering_again_wraps_nothing_twice() -> None:
     zoo.register()
     assert before == (ExperimentManager.create_envs, ExperimentManager._preprocess_hyperparams)
     assert TASK in gym.registry
+
+
+def test_the_shared_policy_is_a_name_of_the_zoo(tmp_path: Path) -> None:
+    experiment = manager(tmp_path, ORDINARY, policy="SharedMlpPolicy", vf_kl_fraction=0.1)
+    model, _ = set_up(experiment)
+    assert type(model.policy) is SharedMlpPolicy and model.vf_kl_fraction == 0.1
+    experiment.learn(model)
+    assert 0.0 < model.logger.name_to_value["train/vf_policy_kl"] <= 0.1 * model.target_kl
 
 
 def steps_between_evaluations(experiment: ExperimentManager) -> list[int]:

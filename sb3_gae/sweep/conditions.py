@@ -36,6 +36,8 @@ CONDITIONS: dict[str, Condition] = {
     "adam": Condition("value function by Adam", {"vf_optimizer": "adam"}),
     "mc_targets": Condition("Monte-Carlo targets", {"value_lambda": 1.0}),
     "lambda_targets": Condition("λ targets", {"value_lambda": None}),
+    "shared_frozen": Condition("shared layers, frozen in the value fit", {"policy": "SharedMlpPolicy", "vf_kl_fraction": 0.0}),
+    "shared_joint": Condition("shared layers, fitted jointly", {"policy": "SharedMlpPolicy", "vf_kl_fraction": 0.01}),
 }
 
 
