@@ -13,6 +13,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.dense_policy import has_dense_policy
+from sb3_gae.parameters import positions
 from sb3_gae.policy_step import DenseFisher
 
 # Second moments of so many samples are good enough for a metric
@@ -40,7 +41,7 @@ def natural_gradients(
     fisher = _prepared_fisher(policy, parameters, batch)
     if fisher is None:
         raise ValueError("Natural gradients need a policy that is an MLP as SB3 builds it, with layers no wider than 512.")
-    places = _places(parameters, fisher.parameters)
+    places = positions(parameters, fisher.parameters).cpu().numpy()
     dtype, device = parameters[0].dtype, parameters[0].device
     result = np.empty_like(gradients)
     for index in np.ndindex(gradients.shape[:-1]):
@@ -70,10 +71,3 @@ def _prepared_fisher(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor],
     part = batch.take(spread)
     fisher = DenseFisher(policy, part.observations)
     return fisher if fisher.prepare(part.actions) else None
-
-
-def _places(parameters: Sequence[th.Tensor], order: Sequence[th.Tensor]) -> np.ndarray:
-    """Where the scalars of each tensor of ``order`` are in vectors over ``parameters``."""
-    ends = np.cumsum([parameter.numel() for parameter in parameters])
-    of = {id(parameter): np.arange(end - parameter.numel(), end) for parameter, end in zip(parameters, ends, strict=True)}
-    return np.concatenate([of[id(parameter)] for parameter in order])

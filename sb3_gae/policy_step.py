@@ -166,8 +166,6 @@ class DenseFisher:
         with th.no_grad():
             old = snapshot(distribution_from_outputs(policy.action_dist, self._outputs, self._log_std))
         self._metric = fisher_metric(old)
-        #: in the order of vectors
-        self.parameters: list[th.Tensor] = [*self._network.parameters, *policy_log_std(policy)]
 
     @property
     def parameters(self) -> list[th.Tensor]:
