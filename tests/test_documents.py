@@ -8,6 +8,7 @@ import gymnasium
 import pytest
 
 from sb3_gae.envs import TASKS
+from sb3_gae.sweep.cli import main
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -42,3 +43,15 @@ def test_code_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(("document", "link"), LINKS)
 def test_links_lead_somewhere(document: Path, link: str) -> None:
     assert (document.parent / link).exists()
+
+
+@pytest.mark.parametrize("sweep", ["fig2-left"])
+def test_tables_of_sweeps_are_what_the_command_prints(
+    sweep: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    command = f"python -m sb3_gae.sweep rank --from benchmarks/results/sweeps/{sweep}.parquet"
+    text = (ROOT / "docs" / "paper-figures.md").read_text()
+    assert f"{command}\n" in text
+    assert main(command.split()[3:]) == 0
+    assert capsys.readouterr().out in text
