@@ -1,5 +1,5 @@
 """
-Draws docs/images/training_*.svg from what docs/training_diagnostics.py has stored, and prints a table of it.
+Draws docs/images/training_*.svg from what docs/training_diagnostics.py has stored, and prints tables of it.
 
     python docs/training_figures.py
 """
@@ -21,7 +21,7 @@ from sb3_gae.callbacks import PAPER_LAMBDAS
 IMAGES = Path(__file__).parent / "images"
 TITLES = {"GaeCartPole-v0": "Cart-pole", "Pendulum-v1": "Pendulum", "GaeBiped-v0": "Biped"}
 # Early, in between, and late
-CHECKPOINTS = {"GaeCartPole-v0": (3, 10, 30), "Pendulum-v1": (5, 20, 97), "GaeBiped-v0": (5, 20, 60)}
+CHECKPOINTS = {"GaeCartPole-v0": (3, 10, 30), "Pendulum-v1": (5, 20, 50), "GaeBiped-v0": (5, 20, 60)}
 COLORS = ("tab:blue", "tab:orange", "tab:green")
 
 
@@ -42,10 +42,19 @@ def shown_checkpoints(rows: Iterable[Result], env: str) -> list[int]:
 
 
 def errors_of(row: Result, kind: str = "own") -> tuple[np.ndarray, np.ndarray]:
-    """:return: bias squared and variance in units of the variance at λ = 1, each with its standard error, shape (2, L)"""
+    """
+    :return: bias squared and variance, each with its standard error, shape (2, L), in units of the variance at λ = 1 with
+        the value function that training goes on with
+    """
     found = row["value_functions"][kind]
-    scale = found["variance"][0][-1]
+    scale = row["value_functions"]["own"]["variance"][0][-1]
     return np.array(found["bias_squared"]) / scale, np.array(found["variance"]) / scale
+
+
+def total_error(row: Result, kind: str = "own") -> np.ndarray:
+    """Bias squared and variance together, in the same units, shape (L,)."""
+    bias_squared, variance = errors_of(row, kind)
+    return np.maximum(bias_squared[0], 0.0) + variance[0]
 
 
 # --- Figures ---
@@ -90,7 +99,7 @@ def draw_errors(axes: Sequence[Axes], row: Result, env: str, color: str, label: 
     for axis, (value, error) in zip(axes, (bias_squared, variance), strict=False):
         axis.plot(horizons, value, color=color, linewidth=1.3, label=label)
         axis.fill_between(horizons, value - error, value + error, color=color, alpha=0.15, linewidth=0)
-    total = np.maximum(bias_squared[0], 0.0) + variance[0]
+    total = total_error(row)
     axes[2].plot(horizons, total, color=color, linewidth=1.3)
     axes[2].plot(horizons[total.argmin()], total.min(), "o", color=color, markersize=4.5)
 
@@ -199,7 +208,24 @@ def draw_over_iterations(axis: Axes, rows: Sequence[Result], curves: dict[str, n
     axis.yaxis.set_minor_formatter(NullFormatter())
 
 
-# --- Table ---
+# --- Tables ---
+
+
+def print_medians(rows: Sequence[Result]) -> None:
+    """Over all checkpoints of all seeds: the error of a batch's gradient at fixed λ and at the best one."""
+    shown = (0.0, 0.68, 0.92, 0.96, 0.98, 1.0)
+    places = [PAPER_LAMBDAS.index(each) for each in shown]
+    names = ["task", "checkpoints", "V", *(f"λ = {each:g}" for each in shown), "best λ", "its error", "middle half of best λ"]
+    print(f"| {' | '.join(names)} |\n|{' --- |' * len(names)}")
+    for env in tasks_of(rows):
+        own = rows_of(rows, env)
+        for kind in ("own", "refitted"):
+            totals = np.array([total_error(row, kind) for row in own])
+            best = np.take(PAPER_LAMBDAS, totals.argmin(axis=1))
+            numbers = [*np.median(totals[:, places], axis=0), np.median(best), np.median(totals.min(axis=1))]
+            low, high = np.percentile(best, [25, 75], method="nearest")
+            cells = [TITLES[env], str(len(own)), kind, *(f"{number:.2f}" for number in numbers), f"{low:g} to {high:g}"]
+            print(f"| {' | '.join(cells)} |")
 
 
 def print_table(rows: Sequence[Result]) -> None:
@@ -207,8 +233,8 @@ def print_table(rows: Sequence[Result]) -> None:
     columns = ["task", "iteration", "return", "squared gradient", "bias² at 0", "0.92", "0.96", "best λ", "its error", "0.96"]
     print(f"| {' | '.join(columns)} |\n|{' --- |' * len(columns)}")
     for row in sorted(rows, key=lambda row: (list(TITLES).index(row["env"]), row["iteration"], row["seed"])):
-        (bias_squared, bias_error), (variance, _) = errors_of(row)
-        total = np.maximum(bias_squared, 0.0) + variance
+        bias_squared, bias_error = errors_of(row)[0]
+        total = total_error(row)
         places = [PAPER_LAMBDAS.index(each) for each in (0.0, 0.92, 0.96)]
         cells = [
             row["env"],
@@ -227,6 +253,8 @@ def main() -> None:
     plt.switch_backend("svg")
     plt.rcParams["svg.hashsalt"] = "sb3-gae"
     rows = stored()
+    print_medians(rows)
+    print()
     print_table(rows)
     figures = {"lambdas": draw_lambdas(rows), "response": draw_response(rows), "values": draw_values(rows)}
     for name, figure in figures.items():

@@ -129,11 +129,7 @@ def exact_case(policy: TabularPolicy, values: np.ndarray, run: str, name: str, k
 
 
 def training_cases(rows: Iterable[Result]) -> list[Case]:
-    return [
-        measured_case(row, kind, found)
-        for row in rows
-        for kind, found in row["value_functions"].items()
-    ]  # fmt: skip
+    return [measured_case(row, kind, found) for row in rows for kind, found in row["value_functions"].items()]
 
 
 def measured_case(row: Result, kind: str, found: Result) -> Case:
@@ -174,12 +170,12 @@ def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float:
 
 
 def within_policies(cases: Sequence[Case], measure: str, target: Target) -> dict[str, list[float]]:
-    """For each run: rank correlations over the value functions of one policy."""
+    """For each run: rank correlations over the value functions of one policy, where neither side is constant."""
     found: dict[str, list[float]] = {}
     for policy in dict.fromkeys(case.policy for case in cases):
         own = [case for case in cases if case.policy == policy]
         correlation = rank_correlation([case.measures[measure] for case in own], [target(case) for case in own])
-        found.setdefault(own[0].run, []).append(correlation)
+        found.setdefault(own[0].run, []).extend([] if np.isnan(correlation) else [correlation])
     return found
 
 
@@ -198,15 +194,19 @@ class Interval(NamedTuple):
         return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
 
 
+def mean_or_nan(numbers: Sequence[float]) -> float:
+    return float(np.mean(numbers)) if numbers else float("nan")
+
+
 def mean_within(cases: Sequence[Case], measure: str, target: Target) -> float:
-    return float(np.nanmean(np.concatenate(list(within_policies(cases, measure, target).values()))))
+    return mean_or_nan([each for run in within_policies(cases, measure, target).values() for each in run])
 
 
 def interval_within(cases: Sequence[Case], measure: str, target: Target) -> Interval:
     """Mean over policies; runs are resampled."""
     runs = list(within_policies(cases, measure, target).values())
     draws = np.random.default_rng(0).integers(len(runs), size=(RESAMPLES, len(runs)))
-    means = [np.nanmean(np.concatenate([runs[run] for run in draw])) for draw in draws]
+    means = [mean_or_nan([each for run in draw for each in runs[run]]) for draw in draws]
     return Interval(mean_within(cases, measure, target), *np.nanpercentile(means, [2.5, 97.5]))
 
 
@@ -263,14 +263,18 @@ def draw(groups: dict[str, Sequence[Case]], gae_lambda: float = 0.96) -> Figure:
         *(Line2D([], [], marker="o", color=COLORS[kind], label=f"V: {kind}", **blank) for kind in COLORS if kind in kinds),
         *(Line2D([], [], marker=MARKERS[task], color="gray", label=task, **blank) for task in MARKERS if task in tasks),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False, fontsize=9)
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False, fontsize=8)
     return figure
 
 
 def scatter(axis: Axes, cases: Sequence[Case], measure: str, target: Target) -> None:
     """Estimates that noise has made negative are left out: the axes are logarithmic."""
-    for case in cases:
-        axis.plot(case.measures[measure], target(case), MARKERS[case.task], color=COLORS[case.kind], ms=3.5, alpha=0.7, mew=0)
+    for task, kind in dict.fromkeys((case.task, case.kind) for case in cases):
+        points = [(case.measures[measure], target(case)) for case in cases if (case.task, case.kind) == (task, kind)]
+        style = dict(color=COLORS[kind], markersize=3.5, markeredgewidth=0, alpha=0.7, zorder=1)
+        axis.plot(*zip(*points, strict=True), MARKERS[task], **style)
+    # One picture of all points: as vectors they would take half a megabyte
+    axis.set_rasterization_zorder(1.5)
     axis.set(xscale="log", yscale="log")
     if measure == UNEXPLAINED:
         # Less than two decades: matplotlib would label the minor ticks, too
@@ -291,7 +295,7 @@ def main() -> None:
         of_task = [case for case in groups["Training"] if case.task == task]
         if len({case.run for case in of_task}) > 1:
             print_table(f"{task}, within a policy, bootstrap over runs", of_task, interval_within)
-    draw(groups).savefig(IMAGE, facecolor="white", metadata={"Date": None, "Creator": None})
+    draw(groups).savefig(IMAGE, dpi=130, facecolor="white", metadata={"Date": None, "Creator": None})
     print(f"\nwrote {IMAGE}")
 
 

@@ -88,6 +88,8 @@ def test_figures_and_tables_come_from_what_is_stored(results: Path, capsys: pyte
     rows = diagnostics.stored(results)
     figures.print_table(rows)
     assert capsys.readouterr().out.count(ENV) == 2
+    figures.print_medians(rows)
+    assert "| Cart-pole | 2 | own |" in capsys.readouterr().out
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(figures.CHECKPOINTS, ENV, (1, 3, 30))
         for draw in (figures.draw_lambdas, figures.draw_response, figures.draw_values):
