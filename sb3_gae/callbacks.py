@@ -8,6 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae.checks import check_count
+from sb3_gae.diagnostics import ValueErrors, value_errors
 from sb3_gae.rollout_buffer import GAERolloutBuffer, LambdaSweep
 from sb3_gae.rollout_diagnostics import LambdaErrors, has_several_trajectories, lambda_errors
 
@@ -49,7 +50,10 @@ class GradientDiagnosticsCallback(BaseCallback):
     collected it. A single rollout says little; average the curves over several. A rollout of a single trajectory is left out.
 
     Keys are ``gradient/<quantity>/lambda_<value>``, the quantities those of :class:`~sb3_gae.LambdaErrors`.
-    The estimates of the last rollout that had any are in ``self.errors``.
+    The estimates of the last rollout that had any are in ``self.errors``. Beside them, to compare: ``value_error/<measure>``
+    with the measures of :class:`~sb3_gae.diagnostics.ValueErrors`, which are in ``self.value_errors``, and
+    ``value_error/policy_gradient``, the bias squared at :math:`\lambda = 0`
+    (:func:`~sb3_gae.rollout_diagnostics.policy_gradient_value_error`).
 
     :param lambdas: weights of longer estimates, each in [0, 1]
     :param every: rollouts from one estimate to the next, the first rollout being the first
@@ -75,6 +79,7 @@ class GradientDiagnosticsCallback(BaseCallback):
         self.n_groups = n_groups
         self.gamma = gamma
         self.errors: LambdaErrors | None = None
+        self.value_errors: ValueErrors | None = None
         self._n_rollouts = 0
 
     def _on_step(self) -> bool:
@@ -87,9 +92,16 @@ class GradientDiagnosticsCallback(BaseCallback):
             return
         policy = self.model.policy
         assert isinstance(policy, ActorCriticPolicy)
+        # λ = 0 for the value function's error as the policy gradient sees it
+        lambdas = self.lambdas if 0.0 in self.lambdas else (*self.lambdas, 0.0)
         with _evaluation_mode(policy):
-            self.errors = lambda_errors(policy, rollout_buffer, self.lambdas, self.gamma, self.n_groups)
+            errors = lambda_errors(policy, rollout_buffer, lambdas, self.gamma, self.n_groups)
+        self.errors = LambdaErrors(*(array[: len(self.lambdas)] for array in errors))
+        self.value_errors = _value_errors(rollout_buffer, self.gamma)
         _log(self, "gradient", self.errors, self.lambdas)
+        for measure, value in self.value_errors._asdict().items():
+            self.logger.record(f"value_error/{measure}", value)
+        self.logger.record("value_error/policy_gradient", float(errors.bias_squared[lambdas.index(0.0)]))
 
 
 def _rollout_buffer(callback: BaseCallback) -> GAERolloutBuffer:
@@ -98,6 +110,17 @@ def _rollout_buffer(callback: BaseCallback) -> GAERolloutBuffer:
         name = type(callback).__name__
         raise TypeError(f"{name} needs a sb3_gae.GAERolloutBuffer, got {type(rollout_buffer).__name__}.")
     return rollout_buffer
+
+
+def _value_errors(rollout_buffer: GAERolloutBuffer, gamma: float | None) -> ValueErrors:
+    return value_errors(
+        rollout_buffer.rewards,
+        rollout_buffer.values,
+        rollout_buffer.next_values,
+        rollout_buffer.dones,
+        rollout_buffer.gamma if gamma is None else gamma,
+        rollout_buffer.mask,
+    )
 
 
 def _log(callback: BaseCallback, group: str, curves: Any, lambdas: Sequence[float]) -> None:

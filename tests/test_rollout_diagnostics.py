@@ -14,6 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from tabular_oracles import random_policy
 
 from sb3_gae import TRPOGAE, GAERolloutBuffer, GradientDiagnosticsCallback, MlpPolicy
+from sb3_gae.diagnostics import value_errors
 from sb3_gae.gridworld import (
     Episodes,
     TabularPolicy,
@@ -181,13 +182,21 @@ class Record(BaseCallback):
         super().__init__()
         self.logged: list[dict[str, Any]] = []
         self.errors: list[Any] = []
+        self.of_values: list[dict[str, float]] = []
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
-        self.logged.append({key: value for key, value in self.logger.name_to_value.items() if "gradient/" in key})
-        self.errors.append(lambda_errors(self.model.policy, self.locals["rollout_buffer"], LAMBDAS, n_groups=4))
+        policy, buffer = self.model.policy, self.locals["rollout_buffer"]
+        kept = ("gradient/", "value_error/")
+        self.logged.append({key: value for key, value in self.logger.name_to_value.items() if key.startswith(kept)})
+        self.errors.append(lambda_errors(policy, buffer, LAMBDAS, n_groups=4))
+        arrays = buffer.rewards, buffer.values, buffer.next_values, buffer.dones
+        of_values = value_errors(*arrays, buffer.gamma, buffer.mask)._asdict()
+        of_gradient = policy_gradient_value_error(policy, buffer, n_groups=4).value[0]
+        self.of_values.append({f"value_error/{name}": value for name, value in of_values.items()})
+        self.of_values[-1]["value_error/policy_gradient"] = of_gradient
 
 
 DICT = spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": spaces.Discrete(3)})
@@ -211,10 +220,13 @@ def test_the_log_holds_every_quantity_for_every_lambda(
     record = Record()
     model.learn(2 * model.n_steps, callback=[GradientDiagnosticsCallback(LAMBDAS, n_groups=4), record])
     assert record.logged
-    for logged, expected in zip(record.logged, record.errors, strict=True):
+    for logged, expected, of_values in zip(record.logged, record.errors, record.of_values, strict=True):
+        for name, value in of_values.items():
+            np.testing.assert_allclose(logged[name], value, rtol=1e-5)
         for quantity in set(expected._fields) - {"gae_lambda"}:
             values = [logged[f"gradient/{quantity}/lambda_{gae_lambda:g}"] for gae_lambda in LAMBDAS]
             np.testing.assert_allclose(values, getattr(expected, quantity))
+        assert len(logged) == len(of_values) + (len(expected) - 1) * len(LAMBDAS)
         assert expected.bias_squared[-1] == 0.0
         assert (expected.variance > 0.0).all()
 
@@ -242,6 +254,29 @@ def test_the_policy_is_left_in_the_mode_that_it_was_in(training: bool) -> None:
     model.policy.set_training_mode(training)
     callback.on_rollout_end()
     assert model.policy.training == training
+
+
+def test_errors_of_values_are_those_at_the_gamma_asked_for_with_or_without_lambda_zero() -> None:
+    callback = GradientDiagnosticsCallback([0.9], gamma=0.5, n_groups=4)
+    model = TRPOGAE("MlpPolicy", "CartPole-v1", n_steps=64, policy_kwargs=SMALL, seed=0, device="cpu")
+    # What is asked for at the end of the last rollout, before its update
+    seen: list[Any] = []
+
+    class Keep(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_rollout_end(self) -> None:
+            buffer = self.locals["rollout_buffer"]
+            arrays = buffer.rewards, buffer.values, buffer.next_values, buffer.dones
+            seen.append((value_errors(*arrays, 0.5, buffer.mask), self.logger.name_to_value["value_error/policy_gradient"]))
+            seen.append(policy_gradient_value_error(self.model.policy, buffer, 0.5, 4).value[0])
+
+    model.learn(64, callback=[callback, Keep()])
+    (expected, logged), of_gradient = seen
+    assert callback.value_errors == expected
+    assert logged == pytest.approx(of_gradient, rel=1e-5)
+    assert callback.errors is not None and callback.errors.bias_squared.shape == (1,)
 
 
 def test_a_rollout_of_a_single_trajectory_is_left_out() -> None:

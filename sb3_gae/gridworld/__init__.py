@@ -11,11 +11,13 @@ from sb3_gae.gridworld.sampling import (
     fitted_values,
     sample_episodes,
 )
+from sb3_gae.gridworld.value_errors import ExactValueErrors, exact_value_errors
 
 __all__ = [
     "MOVES",
     "MOVE_NAMES",
     "Episodes",
+    "ExactValueErrors",
     "GradientMoments",
     "LambdaCurve",
     "TabularMDP",
@@ -24,6 +26,7 @@ __all__ = [
     "episode_advantages",
     "episode_deltas",
     "episode_gradients",
+    "exact_value_errors",
     "fitted_values",
     "gridworld",
     "lagged_gradients",
