@@ -38,7 +38,7 @@ class GradientErrors(NamedTuple):
     :param bias_squared: squared norm of the expected difference from the reference
     :param variance: trace of the covariance of the batch's mean gradient
     :param squared_norm: squared norm of the expected gradient
-    :param inner_product: of the expected gradient with the expected reference
+    :param inner_product: of the expected gradient with the expected reference, see :func:`gradient_errors`
     """
 
     bias_squared: Estimate
@@ -80,7 +80,11 @@ def mean_variance(sums: np.ndarray, weights: ArrayLike, duals: np.ndarray | None
 
 
 def gradient_errors(
-    sums: np.ndarray, weights: ArrayLike, reference: int = -1, duals: np.ndarray | None = None
+    sums: np.ndarray,
+    weights: ArrayLike,
+    reference: int = -1,
+    duals: np.ndarray | None = None,
+    steps: np.ndarray | None = None,
 ) -> GradientErrors:
     r"""
     Bias and variance of gradients that differ in their advantages, from one batch.
@@ -90,18 +94,21 @@ def gradient_errors(
     :param sums: policy gradients summed over each group, shape (G, K, P)
     :param weights: steps (or episodes) of each group, for errors of the mean over steps (or episodes), shape (G,)
     :param reference: index of the vector that is unbiased
-    :param duals: see :func:`squared_norm`
+    :param duals: for the squared norms, see :func:`squared_norm`
+    :param steps: where the gradients lead, for their inner products with the reference; None for the gradients themselves.
+        With a preconditioner :math:`M`, :math:`Mg` for each gradient, shape (G, K, P)
     :return: of the whole batch, each of shape (K,)
     :raises ValueError: if there are fewer than two groups, or a shape does not fit
     """
     sums = np.asarray(sums, dtype=np.float64)
     duals = sums if duals is None else np.asarray(duals, dtype=np.float64)
-    of_reference = np.broadcast_to(duals[:, [reference]], duals.shape)
+    steps = sums if steps is None else np.asarray(steps, dtype=np.float64)
+    of_reference = np.broadcast_to(sums[:, [reference]], sums.shape)
     return GradientErrors(
-        bias_squared=squared_norm(sums - sums[:, [reference]], weights, duals - of_reference),
+        bias_squared=squared_norm(sums - of_reference, weights, duals - duals[:, [reference]]),
         variance=mean_variance(sums, weights, duals),
         squared_norm=squared_norm(sums, weights, duals),
-        inner_product=squared_norm(sums, weights, of_reference),
+        inner_product=squared_norm(of_reference, weights, steps),
     )
 
 

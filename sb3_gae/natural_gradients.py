@@ -6,6 +6,7 @@ of :math:`F` (K-FAC) is inverted once for all of them.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
@@ -20,22 +21,33 @@ from sb3_gae.policy_step import DenseFisher
 _MOST_SAMPLES = 8192
 
 
+class NaturalGradients(NamedTuple):
+    r"""
+    With :math:`M = (F + d)^{-1}`, one symmetric and positive matrix for all gradients.
+
+    :param steps: :math:`s = Mg`, where a trust-region step leads, shape (..., P)
+    :param duals: :math:`MFMg`, whose product with :math:`g` is :math:`s^\top Fs`: the step's squared length as
+        the trust region measures it, without the damping, shape (..., P)
+    """
+
+    steps: np.ndarray
+    duals: np.ndarray
+
+
 def natural_gradients(
     policy: ActorCriticPolicy,
     parameters: Sequence[th.Tensor],
     batch: TrainingBatch,
     gradients: np.ndarray,
     damping: float = 0.1,
-) -> np.ndarray:
+) -> NaturalGradients:
     r"""
-    About :math:`(F + d)^{-1} g` for each gradient, by one symmetric and positive matrix for all of them.
-
     :param policy: an MLP as SB3 builds it
     :param parameters: what the gradients are by, P scalars in all, see :func:`~sb3_gae.policy_step.policy_parameters`
     :param batch: observations and the actions that the policy drew for them
     :param gradients: shape (..., P)
     :param damping: :math:`d`, positive
-    :return: same shape
+    :return: see :class:`NaturalGradients`
     :raises ValueError: if the policy is of another kind
     """
     fisher = _prepared_fisher(policy, parameters, batch)
@@ -43,13 +55,19 @@ def natural_gradients(
         raise ValueError("Natural gradients need a policy that is an MLP as SB3 builds it, with layers no wider than 512.")
     places = positions(parameters, fisher.parameters).cpu().numpy()
     dtype, device = parameters[0].dtype, parameters[0].device
-    result = np.empty_like(gradients)
-    for index in np.ndindex(gradients.shape[:-1]):
+
+    def solved(vector: np.ndarray) -> np.ndarray:
         # Unit length, so that gradients of 1e-30 and 1e30 come out alike in single precision
-        length = float(np.linalg.norm(gradients[index])) or 1.0
-        vector = th.as_tensor(gradients[index][places] / length, dtype=dtype, device=device)
-        result[index][places] = length * fisher.precondition(vector, damping).cpu().double().numpy()
-    return result
+        length, result = float(np.linalg.norm(vector)) or 1.0, np.empty_like(vector)
+        scaled = th.as_tensor(vector[places] / length, dtype=dtype, device=device)
+        result[places] = length * fisher.precondition(scaled, damping).cpu().double().numpy()
+        return result
+
+    steps, twice = np.empty_like(gradients), np.empty_like(gradients)
+    for index in np.ndindex(gradients.shape[:-1]):
+        steps[index] = solved(gradients[index])
+        twice[index] = solved(steps[index])
+    return NaturalGradients(steps, steps - damping * twice)
 
 
 def has_natural_gradients(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor], batch: TrainingBatch) -> bool:

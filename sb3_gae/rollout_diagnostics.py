@@ -112,8 +112,9 @@ def lambda_errors(
     :param lambdas: weights of longer estimates, each in [0, 1], shape (L,)
     :param gamma: discount factor, None for the buffer's own
     :param n_groups: of trajectories; more than 16 lower the noise little
-    :param metric: of norms and products: ``"euclidean"``, or ``"fisher"`` for :math:`\|g\|^2 = g^\top F^{-1} g`, which is
-        what a trust-region step goes by; see :mod:`sb3_gae.natural_gradients`
+    :param metric: ``"euclidean"`` for norms and products of the gradients themselves, or ``"fisher"`` for those of the
+        trust-region steps that they lead to: norms are :math:`s^\top Fs` with :math:`s = (F + d)^{-1}g`, and the inner
+        product is that of the step with the gradient of :math:`\lambda = 1`; see :mod:`sb3_gae.natural_gradients`
     :return: see :class:`LambdaErrors`
     :raises ValueError: if the buffer is not full, has a single trajectory, a factor is out of range, or the metric is unknown
     """
@@ -123,11 +124,11 @@ def lambda_errors(
     rewards, values, next_values = _td_arrays(rollout_buffer)
     advantages = advantage_grid(rewards, values, next_values, rollout_buffer.dones, [gamma], [*lambdas, 1.0])[0]
     sums, groups = _gradient_sums(policy, rollout_buffer, advantages, n_groups)
-    duals = None
+    steps = duals = None
     if metric == "fisher":
         batch = training_batch(rollout_buffer, policy.action_space)
-        duals = natural_gradients(policy, policy_parameters(policy, batch), batch, sums)
-    errors = gradient_errors(sums, np.bincount(groups), duals=duals)
+        steps, duals = natural_gradients(policy, policy_parameters(policy, batch), batch, sums)
+    errors = gradient_errors(sums, np.bincount(groups), duals=duals, steps=steps)
     bias, variance, norm, product = (Estimate(*(array[:-1] for array in each)) for each in errors)
     return LambdaErrors(
         gae_lambda=np.asarray(lambdas, dtype=np.float64),

@@ -31,7 +31,7 @@ def test_a_metric_is_a_change_of_coordinates(seed: int, n_groups: int, n_paramet
     generator = np.random.default_rng(seed)
     sums, root = generator.normal(size=(n_groups, 3, n_parameters)), generator.normal(size=(n_parameters, n_parameters))
     weights = generator.uniform(1, 5, n_groups)
-    in_metric = gradient_errors(sums, weights, duals=sums @ (root @ root.T))
+    in_metric = gradient_errors(sums, weights, duals=sums @ (root @ root.T), steps=sums @ (root @ root.T))
     for found, expected in zip(in_metric, gradient_errors(sums @ root, weights), strict=True):
         np.testing.assert_allclose(found.value, expected.value, rtol=1e-8, atol=1e-10)
 
@@ -45,6 +45,10 @@ def test_inner_products_are_those_with_the_reference_in_other_groups() -> None:
     errors = gradient_errors(sums, weights, reference=1)
     np.testing.assert_allclose(errors.inner_product.value, expected)
     assert errors.inner_product.value[1] == pytest.approx(errors.squared_norm.value[1])
+    matrix = generator.normal(size=(5, 5))
+    elsewhere = gradient_errors(sums, weights, reference=1, steps=sums @ (matrix + matrix.T)).inner_product.value
+    products = np.sum([(sums[j] @ (matrix + matrix.T) @ sums[k, 1]) for j, k in pairs], axis=0)
+    np.testing.assert_allclose(elsewhere, products / sum(weights[j] * weights[k] for j, k in pairs))
 
 
 def test_two_equal_halves_give_the_product_and_the_quarter_of_the_difference() -> None:
