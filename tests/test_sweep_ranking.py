@@ -76,7 +76,7 @@ def test_as_a_table(returns: dict[Curve, np.ndarray]) -> None:
 
 
 def test_what_it_does_not_know(returns: dict[Curve, np.ndarray]) -> None:
-    with pytest.raises(SweepError, match="`by` must be one of training, last, got 'first'"):
+    with pytest.raises(SweepError, match="`by` must be one of last, training, got 'first'"):
         rank_curves(table_of(returns), by="first")
     with pytest.raises(SweepError, match="`iteration` must be from 1 to 4"):
         rank_curves(table_of(returns), iteration=5)

@@ -272,3 +272,10 @@ def test_runs_of_several_sweeps_are_kept_apart(table: pd.DataFrame, tmp_path: Pa
     study = SweepStudy("both", str(tmp_path / "both.journal"))
     assert take_in(study, pd.concat([table, second])) == 2 * len(CELLS)
     assert len(results_of(study)) == 2 * len(table)
+
+
+def test_conditions_without_lambda_are_told_apart(table: pd.DataFrame) -> None:
+    chosen = table[(table["condition"] == "no_vf") | (table["gae_lambda"] == 0.5)]
+    both = pd.concat([chosen, chosen[chosen["condition"] == "no_vf"].assign(condition="measured_lambda")])
+    lines = curves_figure(both).axes[0].lines
+    assert len({(str(line.get_color()), str(line.get_linestyle()), line._unscaled_dash_pattern) for line in lines}) == 4  # type: ignore[attr-defined]

@@ -8,7 +8,7 @@ from rl_zoo3.utils import StoreDict
 from sb3_gae.sweep.conditions import CONDITIONS
 from sb3_gae.sweep.figures import KINDS
 from sb3_gae.sweep.presets import PRESETS
-from sb3_gae.sweep.series import RANKED_BY
+from sb3_gae.sweep.series import SCORES
 
 _EXAMPLES = """examples:
   python -m sb3_gae.sweep run --preset small --jobs 2
@@ -78,18 +78,22 @@ def _add_figure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("kind", choices=KINDS)
     _add_selection(parser)
     parser.add_argument("-o", "--output", help="PNG or SVG file; without an ending both (default: logs/sweeps/NAME_KIND)")
-    parser.add_argument("--iteration", type=int, help="whose returns heatmap and lambda show (default: the last)")
+    _add_score(parser, default="last")
 
 
 def _add_rank(parser: argparse.ArgumentParser) -> None:
     _add_selection(parser)
+    _add_score(parser, default="training")
+
+
+def _add_score(parser: argparse.ArgumentParser, default: str) -> None:
     parser.add_argument(
         "--by",
-        choices=RANKED_BY,
-        default="training",
-        help="the mean return over training (area under the learning curve), or the last one (default: training)",
+        choices=SCORES,
+        default=default,
+        help=f"the return of the last iteration, or the mean over training (default: {default}; not for curves)",
     )
-    parser.add_argument("--iteration", type=int, help="where training counts as ended (default: the last)")
+    parser.add_argument("--iteration", type=int, help="in place of the last (not for curves)")
 
 
 def _add_selection(parser: argparse.ArgumentParser) -> None:

@@ -131,7 +131,8 @@ def _import(args: argparse.Namespace) -> int:
 
 def _figure(args: argparse.Namespace) -> int:
     table, name = _results_of(args)
-    for path in draw(args.kind, table, args.output or f"logs/sweeps/{name}_{args.kind}", args.iteration, **selection_of(args)):
+    output = args.output or f"logs/sweeps/{name}_{args.kind}"
+    for path in draw(args.kind, table, output, args.iteration, args.by, **selection_of(args)):
         print(f"wrote {path}")
     return 0
 

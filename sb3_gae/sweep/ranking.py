@@ -6,10 +6,9 @@ import numpy as np
 import pandas as pd
 
 from sb3_gae.sweep.conditions import CONDITIONS
-from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.figures.wording import with_interval
 from sb3_gae.sweep.grid import Curve
-from sb3_gae.sweep.series import RANKED_BY, at_iteration, series_of
+from sb3_gae.sweep.series import scores_of, series_of
 from sb3_gae.sweep.statistics import Estimate, difference, estimate_each
 
 
@@ -44,14 +43,9 @@ def rank_curves(table: pd.DataFrame, iteration: int | None = None, by: str = "tr
     :return: the best one first
     :raises SweepError: if ``by`` is unknown, the runs are shorter, or in some no episode had ended by then
     """
-    if by not in RANKED_BY:
-        raise SweepError(f"`by` must be one of {', '.join(RANKED_BY)}, got {by!r}.")
     series = series_of(table)
-    last, iteration = at_iteration(series, iteration)
-    # In the first batches of long episodes none may have ended
-    training = [np.nanmean(one.returns[:, :iteration], axis=1) for one in series]
-    scores = training if by == "training" else last
-    of_training, of_last = estimate_each(training), estimate_each(last)
+    scores = scores_of(series, by, iteration).values
+    of_training, of_last = (estimate_each(scores_of(series, each, iteration).values) for each in ("training", "last"))
     ranked = of_training if by == "training" else of_last
     order = np.argsort([-float(found.iqm[0]) for found in ranked], kind="stable")
     best = scores[order[0]]

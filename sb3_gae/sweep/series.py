@@ -10,8 +10,8 @@ from sb3_gae.sweep.conditions import CONDITIONS
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Curve
 
-#: what curves are put in order by: the mean return over training or that at its end
-RANKED_BY = ("training", "last")
+#: one number for a run: its return at an iteration, or the mean over all until then, the area under its learning curve
+SCORES = ("last", "training")
 
 
 class Series(NamedTuple):
@@ -47,21 +47,37 @@ def series_of(table: pd.DataFrame) -> list[Series]:
     )
 
 
-def at_iteration(series: list[Series], iteration: int | None) -> tuple[list[np.ndarray], int]:
+class Scores(NamedTuple):
+    """
+    :param values: of each series, of shape (seeds,)
+    :param when: they are from, for labels
+    """
+
+    values: list[np.ndarray]
+    when: str
+
+
+def scores_of(series: list[Series], by: str = "last", iteration: int | None = None) -> Scores:
     """
     :param series: of runs of one length
-    :param iteration: from 1; None for the last
-    :return: returns there, each of shape (seeds,), and the iteration
-    :raises SweepError: if the runs are shorter, or no episode had ended by then
+    :param by: one of :data:`SCORES`
+    :param iteration: from 1, later ones do not count; None for the last
+    :return: a number for each run
+    :raises SweepError: if ``by`` is unknown, the runs are shorter, or in some no episode had ended by then
     """
+    if by not in SCORES:
+        raise SweepError(f"`by` must be one of {', '.join(SCORES)}, got {by!r}.")
     n_iterations = series[0].returns.shape[1]
     iteration = n_iterations if iteration is None else iteration
     if not 1 <= iteration <= n_iterations:
         raise SweepError(f"`iteration` must be from 1 to {n_iterations}, the length of the runs, got {iteration}.")
-    values = [one.returns[:, iteration - 1] for one in series]
-    if any(np.isnan(value).any() for value in values):
+    if any(np.isnan(one.returns[:, iteration - 1]).any() for one in series):
         raise SweepError(f"`iteration`: in some runs no episode had ended by iteration {iteration}; choose a later one.")
-    return values, iteration
+    if by == "last":
+        return Scores([one.returns[:, iteration - 1] for one in series], f"at iteration {iteration}")
+    # In the first batches of long episodes none may have ended
+    means = [np.nanmean(one.returns[:, :iteration], axis=1) for one in series]
+    return Scores(means, f"over {iteration} iterations")
 
 
 def with_lambda(series: list[Series]) -> list[Series]:

@@ -11,7 +11,14 @@ from sb3_gae.sweep.results import select
 KINDS = ("curves", "heatmap", "lambda")
 
 
-def draw(kind: str, table: pd.DataFrame, output: str | Path, iteration: int | None = None, **selection: Any) -> list[Path]:
+def draw(
+    kind: str,
+    table: pd.DataFrame,
+    output: str | Path,
+    iteration: int | None = None,
+    by: str = "last",
+    **selection: Any,
+) -> list[Path]:
     """
     Draw a figure as PNG and SVG. The same results give the same files, bit for bit.
 
@@ -19,6 +26,7 @@ def draw(kind: str, table: pd.DataFrame, output: str | Path, iteration: int | No
     :param table: of results
     :param output: path; with the ending ``.png`` or ``.svg`` only that one is written
     :param iteration: whose returns are shown, from 1; None for the last. Of no use to ``curves``
+    :param by: ``last`` for the returns of that iteration, ``training`` for the mean over all until then
     :param selection: arguments of :func:`~sb3_gae.sweep.results.select`
     :return: paths of the files
     :raises SweepError: if the selection has nothing to show, or a file cannot be written
@@ -29,4 +37,4 @@ def draw(kind: str, table: pd.DataFrame, output: str | Path, iteration: int | No
     # Every process of a sweep would wait for matplotlib and rliable
     from sb3_gae.sweep.figures.files import write_figure
 
-    return write_figure(kind, chosen, Path(output), iteration)
+    return write_figure(kind, chosen, Path(output), iteration, by)

@@ -17,18 +17,19 @@ FIGURES: dict[str, Callable[..., Figure]] = {"curves": curves_figure, "heatmap":
 SUFFIXES = (".png", ".svg")
 
 
-def write_figure(kind: str, table: pd.DataFrame, output: Path, iteration: int | None) -> list[Path]:
+def write_figure(kind: str, table: pd.DataFrame, output: Path, iteration: int | None, by: str) -> list[Path]:
     """
     :param kind: a key of :data:`FIGURES`
     :param table: selected by :func:`~sb3_gae.sweep.results.select`
     :param output: as :func:`~sb3_gae.sweep.figures.draw`
     :param iteration: as there
+    :param by: as there
     :return: paths of the files
     :raises SweepError: if there is nothing to show, or a file cannot be written
     """
     paths = [output] if output.suffix in SUFFIXES else [output.with_name(output.name + suffix) for suffix in SUFFIXES]
     with rc_context(STYLE):
-        figure = FIGURES[kind](table) if kind == "curves" else FIGURES[kind](table, iteration)
+        figure = FIGURES[kind](table) if kind == "curves" else FIGURES[kind](table, iteration, by)
         try:
             output.parent.mkdir(parents=True, exist_ok=True)
             for path in paths:

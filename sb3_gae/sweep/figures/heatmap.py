@@ -11,21 +11,22 @@ from matplotlib.patches import Rectangle
 
 from sb3_gae.sweep.figures.style import RED, new_figure, readable_on
 from sb3_gae.sweep.figures.wording import best, rounded, what
-from sb3_gae.sweep.series import Series, at_iteration, series_of, with_lambda
+from sb3_gae.sweep.series import Series, scores_of, series_of, with_lambda
 from sb3_gae.sweep.statistics import estimate_each
 
 
-def heatmap_figure(table: pd.DataFrame, iteration: int | None = None) -> Figure:
+def heatmap_figure(table: pd.DataFrame, iteration: int | None = None, by: str = "last") -> Figure:
     """
     Interquartile mean over seeds; each cell has its number of seeds, the best one a frame.
 
     :param table: selected by :func:`~sb3_gae.sweep.results.select`
     :param iteration: from 1; None for the last
+    :param by: one of :data:`~sb3_gae.sweep.series.SCORES`
     :return: the figure
     :raises SweepError: if there is not one condition with λ
     """
     series = with_lambda(series_of(table))
-    values, iteration = at_iteration(series, iteration)
+    values, when = scores_of(series, by, iteration)
     results = estimate_each(values)
     means = [float(result.iqm[0]) for result in results]
     gammas = sorted({one.curve.gamma for one in series})
@@ -43,7 +44,7 @@ def heatmap_figure(table: pd.DataFrame, iteration: int | None = None) -> Figure:
     axes.set_xlabel("λ")
     axes.set_ylabel("γ", rotation=0, labelpad=10)
     axes.spines[:].set_visible(False)
-    colorbar = figure.colorbar(mesh, ax=axes, label=f"mean return at iteration {iteration} (IQM)", pad=0.02)
+    colorbar = figure.colorbar(mesh, ax=axes, label=f"mean return {when} (IQM)", pad=0.02)
     colorbar.outline.set_visible(False)
     axes.set_title(f"{what(table, series)}\nbest (framed): {best(series[first].curve, results[first])}")
     return figure

@@ -9,25 +9,26 @@ from matplotlib.figure import Figure
 
 from sb3_gae.sweep.conditions import CONDITIONS
 from sb3_gae.sweep.errors import SweepError
-from sb3_gae.sweep.figures.style import GREY, RED, RETURN_LABEL, new_figure
+from sb3_gae.sweep.figures.style import RED, RETURN_LABEL, new_figure, style_without_lambda
 from sb3_gae.sweep.figures.wording import best, seeds, what
-from sb3_gae.sweep.series import Series, at_iteration, series_of, with_lambda
+from sb3_gae.sweep.series import Series, scores_of, series_of, with_lambda
 from sb3_gae.sweep.statistics import Estimate, estimate_each
 
 
-def lambda_figure(table: pd.DataFrame, iteration: int | None = None) -> Figure:
+def lambda_figure(table: pd.DataFrame, iteration: int | None = None, by: str = "last") -> Figure:
     """
     What each λ loses against the best one, a U between bias and variance; the right-hand axis has the return itself.
 
     :param table: selected by :func:`~sb3_gae.sweep.results.select`
     :param iteration: from 1; None for the last
+    :param by: one of :data:`~sb3_gae.sweep.series.SCORES`
     :return: the figure
     :raises SweepError: if there is not one γ and one condition with λ, or there are fewer than two λ
     """
     everything = series_of(table)
     series = _rising(with_lambda(everything))
     without = [one for one in everything if one.curve.gae_lambda is None]
-    values, iteration = at_iteration([*series, *without], iteration)
+    values, when = scores_of([*series, *without], by, iteration)
     results = estimate_each(values)
     of_lambda, of_others = results[: len(series)], results[len(series) :]
     first = int(np.argmax([result.iqm[0] for result in of_lambda]))
@@ -37,7 +38,7 @@ def lambda_figure(table: pd.DataFrame, iteration: int | None = None) -> Figure:
     _draw_others(axes, without, of_others, top)
     axes.set_xticks(range(len(series)), [f"{one.curve.gae_lambda:g}" for one in series])
     axes.set_xlabel("λ (evenly spaced, not to scale)")
-    axes.set_ylabel(f"return lost against the best λ at iteration {iteration}")
+    axes.set_ylabel(f"return lost against the best λ, {when}")
 
     def below(value: Any) -> Any:
         return top - value
@@ -70,7 +71,7 @@ def _draw_u(axes: Axes, results: list[Estimate], top: float, first: int) -> None
 
 
 def _draw_others(axes: Axes, series: list[Series], results: list[Estimate], top: float) -> None:
-    for one, result in zip(series, results, strict=True):
-        label = CONDITIONS[one.curve.condition].title
-        axes.axhline(top - float(result.iqm[0]), color=GREY, linestyle=(0, (5, 2)), label=label)
-        axes.axhspan(top - float(result.high[0]), top - float(result.low[0]), color=GREY, alpha=0.1, linewidth=0)
+    for place, (one, result) in enumerate(zip(series, results, strict=True)):
+        style, label = style_without_lambda(place), CONDITIONS[one.curve.condition].title
+        axes.axhline(top - float(result.iqm[0]), label=label, **style)
+        axes.axhspan(top - float(result.high[0]), top - float(result.low[0]), color=style["color"], alpha=0.1, linewidth=0)

@@ -24,8 +24,6 @@ STYLE: Any = {
 }
 
 RETURN_LABEL = "mean episode return (sum of rewards)"
-#: of conditions without λ
-GREY = "0.25"
 #: of the best
 RED = "#d62728"
 
@@ -41,12 +39,19 @@ def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
 
 
 _DASHES = ("-", "--", "-.", ":")
+# Of conditions without λ, where there are several: none of the colours of λ, and dashes for those who see no colours
+_WITHOUT_LAMBDA: tuple[tuple[str, tuple[int, ...]], ...] = (
+    ("0.25", (5, 2)),
+    ("#d6289a", (2, 1)),
+    ("black", (6, 1, 1, 1)),
+    ("#8c564b", (1, 1)),
+)
 
 
 def line_styles(series: Sequence[Series]) -> list[dict[str, Any]]:
     """
     :param series: in the order in which they are drawn
-    :return: for each: a condition without λ in grey; colours tell λ apart and dashes γ, or colours all where there are
+    :return: for each: conditions without λ dashed; colours tell λ apart and dashes γ, or colours all where there are
         more γ than dashes, or several conditions
     """
     of_lambda = [one.curve for one in series if one.curve.gae_lambda is not None]
@@ -54,15 +59,25 @@ def line_styles(series: Sequence[Series]) -> list[dict[str, Any]]:
     by_lambda = len(gammas) <= len(_DASHES) and len({curve.condition for curve in of_lambda}) == 1
     hues = list(dict.fromkeys(curve.gae_lambda if by_lambda else curve for curve in of_lambda))
     shades = colormaps["turbo"](np.linspace(0.06, 0.92, max(len(hues), 1)))
+    without = [one.curve for one in series if one.curve.gae_lambda is None]
     styles: list[dict[str, Any]] = []
     for one in series:
         if one.curve.gae_lambda is None:
-            styles.append({"color": GREY, "linestyle": (0, (5, 2)), "linewidth": 2.0})
+            styles.append(style_without_lambda(without.index(one.curve)))
         else:
             shade = shades[hues.index(one.curve.gae_lambda if by_lambda else one.curve)]
             dash = _DASHES[gammas.index(one.curve.gamma)] if by_lambda else "-"
             styles.append({"color": shade, "linestyle": dash, "linewidth": 1.7})
     return styles
+
+
+def style_without_lambda(place: int) -> dict[str, Any]:
+    """
+    :param place: of a condition among those without λ
+    :return: of its line
+    """
+    colour, dashes = _WITHOUT_LAMBDA[place % len(_WITHOUT_LAMBDA)]
+    return {"color": colour, "linestyle": (0, dashes), "linewidth": 2.0}
 
 
 def readable_on(colour: Sequence[float]) -> str:
