@@ -37,7 +37,6 @@ from sb3_gae.policy_step import policy_parameters
 from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.grid import Cell
 from sb3_gae.sweep.plan import Options
-from sb3_gae.value_step import value_parameters
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results" / "training_diagnostics.jsonl"
 N_GROUPS = 16
@@ -188,9 +187,9 @@ def value_functions(player: Player, frozen: Checkpoint, before: Checkpoint) -> d
     for buffer in player.rollouts(2):
         deviation = returns_of(buffer)[player.counted(buffer)].std()
         batch = training_batch(buffer, model.action_space)
-        of_value = value_parameters(model.policy, batch, policy_parameters(model.policy, batch))
+        parameters = model._parameter_groups(batch)
         for _ in range(2):
-            model._fit_value(batch, of_value)
+            model._fit_value(batch, parameters)
     refitted = copy.deepcopy(model.policy.state_dict())
     weight, bias, scale = (own[f"value_net.{name}"] for name in ("weight", "bias", "scale"))
     return {

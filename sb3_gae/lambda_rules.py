@@ -24,7 +24,13 @@ CRITERIA = ("improvement", "squared_error")
 
 @runtime_checkable
 class LambdaRule(Protocol):
-    r"""A source of :math:`\lambda`. What it learns from one batch it applies to the next, so that no batch chooses its own."""
+    r"""
+    A source of :math:`\lambda`. What it learns from one batch it applies to the next, so that no batch chooses its own.
+
+    ``target_lambda`` is for the value targets where the user says nothing of them, None for that of the advantages.
+    """
+
+    target_lambda: float | None
 
     def value(self, progress_remaining: float) -> float:
         """
@@ -47,6 +53,8 @@ class ScheduledLambda:
     :param schedule: of the remaining progress, from 1 to 0
     """
 
+    target_lambda: float | None = None
+
     def __init__(self, schedule: Callable[[float], float]):
         self.schedule = schedule
 
@@ -67,6 +75,8 @@ class ExplainedVarianceLambda:
     :param lowest: :math:`\lambda_{min}`, what a perfect value function gets
     :param memory: weight of the past in the average of the explained variance
     """
+
+    target_lambda: float | None = None
 
     def __init__(self, lowest: float = 0.9, memory: float = 0.8):
         self.lowest = lowest
@@ -101,6 +111,8 @@ class MeasuredLambda:
         :func:`~sb3_gae.rollout_diagnostics.expected_improvement`, ``"squared_error"`` for the least bias squared and variance
     :param metric: of the gradients, ``"fisher"`` or ``"euclidean"``. Policies that are no MLP as SB3 builds it have
         the latter in any case
+    :param target_lambda: :math:`\lambda` of the value targets where ``value_lambda`` is None. What is measured is of the
+        policy gradient, and says nothing of what the value function should be fitted to; None to follow it all the same
     :raises ValueError: if the grid is no ascending list in [0, 1] that ends with 1, or a name is unknown
     """
 
@@ -112,17 +124,21 @@ class MeasuredLambda:
         patience: int = 5,
         criterion: str = "improvement",
         metric: str = "fisher",
+        target_lambda: float | None = 0.96,
     ):
         check_unit_interval("lambdas", lambdas)
         if lambdas[-1] != 1.0 or not np.all(np.diff(lambdas) > 0):
             raise ValueError(f"`lambdas` must ascend and end with 1, got {lambdas!r}.")
         check_choice("criterion", criterion, CRITERIA)
         check_choice("metric", metric, METRICS)
+        if target_lambda is not None:
+            check_number("target_lambda", target_lambda, 0.0, 1.0)
         self.lambdas = tuple(lambdas)
         self.memory = memory
         self.patience = patience
         self.criterion = criterion
         self.metric = metric
+        self.target_lambda = target_lambda
         self.place = int(np.argmin(np.abs(np.subtract(lambdas, start))))
         self._sums = np.zeros((4, len(lambdas)))
         self._weight = 0.0

@@ -89,7 +89,7 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
     :param seed: for the pseudo-random generators
     :param device: on which to run
     :param value_lambda: :math:`\lambda` of the value targets; 1 gives the paper's Monte-Carlo returns,
-        None the same as ``gae_lambda``
+        None the same as ``gae_lambda``, or what its rule says
     :param vf_trust_region: largest mean of :math:`(V - V_{old})^2 / 2\sigma^2` in a value step: the paper's
         :math:`\epsilon`, where :math:`\sigma^2` is the mean squared error before the step. No units
     :param vf_steps: largest number of value steps a rollout
@@ -349,6 +349,8 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         """Values, advantages and targets of a full buffer, all with the value function as it is now."""
         rollout_buffer.gamma, rollout_buffer.gae_lambda = self.gamma, self.gae_lambda
         rollout_buffer.value_lambda = self.value_lambda
+        if self.value_lambda is None and self._lambda_rule is not None:
+            rollout_buffer.value_lambda = self._lambda_rule.target_lambda
         if (head := self._value_head()) is not None and head.n_batches == 0:
             head.initialize_scale(rollout_buffer.to_torch(reward_returns(rollout_buffer)))
         last_values = evaluate_rollout(self.policy, rollout_buffer, self._rollout_end)

@@ -226,6 +226,31 @@ def test_networks_of_other_kinds_are_measured_in_the_euclidean_metric(monkeypatc
     assert metrics == ["fisher", "euclidean"]
 
 
+@pytest.mark.parametrize(
+    ("gae_lambda", "value_lambda", "expected"),
+    [
+        (MeasuredLambda(start=0.68), None, 0.96),
+        (MeasuredLambda(start=0.68, target_lambda=0.5), None, 0.5),
+        (MeasuredLambda(start=0.68, target_lambda=None), None, 0.68),
+        (MeasuredLambda(start=0.68), 0.3, 0.3),
+        (lambda progress: 0.68, None, 0.68),
+        ("explained_variance", None, 1.0),
+    ],
+)
+def test_value_targets_have_a_lambda_of_their_own(gae_lambda: Any, value_lambda: float | None, expected: float) -> None:
+    model = small_model(vec_env(n_envs=4), n_steps=40, gae_lambda=gae_lambda, value_lambda=value_lambda)
+    train_once(model)
+    fixed = small_model(vec_env(n_envs=4), n_steps=40, gae_lambda=model.gae_lambda, value_lambda=expected)
+    train_once(fixed)
+    np.testing.assert_array_equal(model.rollout_buffer.advantages, fixed.rollout_buffer.advantages)
+    np.testing.assert_array_equal(model.rollout_buffer.returns, fixed.rollout_buffer.returns)
+
+
+def test_a_target_lambda_is_checked() -> None:
+    with pytest.raises(ValueError, match="`target_lambda` must be a number in"):
+        MeasuredLambda(target_lambda=1.1)
+
+
 def test_a_schedule_is_followed() -> None:
     model = small_model(vec_env(), gae_lambda=lambda progress: 0.5 + 0.5 * progress)
     log = RolloutLog()
