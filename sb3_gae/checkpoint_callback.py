@@ -83,8 +83,10 @@ class ResumableCheckpointCallback(BaseCallback):
         if (resumed := self._resumable.take_resumed()) is not None:
             restore_callbacks(root, resumed["callbacks"])
             restore_log(self.logger, resumed["log"])
-            # What was resumed from is there
-            self._next_save, self._last_saved = self.n_calls + self.save_freq, self.model.num_timesteps
+            self._next_save = self.n_calls
+            if is_whole(self._path):
+                # What was resumed from
+                self._next_save, self._last_saved = self.n_calls + self.save_freq, self.model.num_timesteps
         if self.handle_signals:
             self._signals.install()
             self._resumable.when_learning_ends(self._signals.restore)
@@ -118,7 +120,7 @@ class ResumableCheckpointCallback(BaseCallback):
         self._end_if_asked()
 
     def _save(self) -> None:
-        path = checkpoint_path(self.save_path, self.name_prefix, self.model.num_timesteps)
+        path = self._path
         if self._last_saved == self.model.num_timesteps:
             return
         self._next_save = self.n_calls + self.save_freq
@@ -156,6 +158,10 @@ class ResumableCheckpointCallback(BaseCallback):
             flush=True,
         )
         self._signals.deliver()
+
+    @property
+    def _path(self) -> Path:
+        return checkpoint_path(self.save_path, self.name_prefix, self.model.num_timesteps)
 
     @property
     def _progress(self) -> tuple[int, int]:
