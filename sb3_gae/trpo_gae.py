@@ -36,6 +36,7 @@ from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
 from sb3_gae.lambda_rules import LambdaRule, lambda_rule
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
 from sb3_gae.policy_step import policy_parameters, policy_step
+from sb3_gae.portable_model import PortableModel
 from sb3_gae.resumable import ResumableModel
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
 from sb3_gae.shared_features import ParameterGroups, SharedParameters, policy_step_radius, shared_parameters
@@ -47,7 +48,7 @@ from sb3_gae.value_head import ValueHead
 from sb3_gae.value_step import ValueFitRecord, value_parameters, value_steps
 
 
-class TRPOGAE(ResumableModel, OnPolicyAlgorithm):
+class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
     r"""
     Trust-region policy optimization with generalized advantage estimation and a trust-region value function.
 
