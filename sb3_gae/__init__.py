@@ -6,6 +6,7 @@ arXiv 1506.02438.
 """
 
 from sb3_gae.callbacks import GradientDiagnosticsCallback, LambdaSweepCallback
+from sb3_gae.checkpoint_callback import ResumableCheckpointCallback
 from sb3_gae.envs import register_tasks
 from sb3_gae.errors import NumericalError
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
@@ -36,5 +37,6 @@ __all__ = [
     "MujocoVecEnv",
     "MultiInputPolicy",
     "NumericalError",
+    "ResumableCheckpointCallback",
     "SharedMlpPolicy",
 ]

@@ -36,8 +36,9 @@ from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
 from sb3_gae.lambda_rules import LambdaRule, lambda_rule
 from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
 from sb3_gae.policy_step import policy_parameters, policy_step
+from sb3_gae.portable_model import PortableModel
+from sb3_gae.resumable import ResumableModel
 from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
-from sb3_gae.saved_model import SavedModel
 from sb3_gae.shared_features import ParameterGroups, SharedParameters, policy_step_radius, shared_parameters
 from sb3_gae.threads import threads_for_steps
 from sb3_gae.time_baseline import TimeBaseline
@@ -47,7 +48,7 @@ from sb3_gae.value_head import ValueHead
 from sb3_gae.value_step import ValueFitRecord, value_parameters, value_steps
 
 
-class TRPOGAE(SavedModel, OnPolicyAlgorithm):
+class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
     r"""
     Trust-region policy optimization with generalized advantage estimation and a trust-region value function.
 
@@ -251,6 +252,8 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         :raises NumericalError: if a parameter of the policy, an observation, action, reward or value is not finite
         """
         assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
+        # First, so that a callback finds everything as the last iteration left it
+        callback.on_rollout_start()
         quota = EpisodeQuota(env.num_envs, self.n_episodes)
         if self.n_episodes is not None and not self._last_episode_starts.all():
             self._last_obs, self._last_episode_starts = cast(Observations, env.reset()), np.ones(env.num_envs, dtype=bool)
@@ -260,7 +263,6 @@ class TRPOGAE(SavedModel, OnPolicyAlgorithm):
         rollout_buffer.reset()
         if self.use_sde:
             self.policy.reset_noise(env.num_envs)
-        callback.on_rollout_start()
         with threads_for_steps(self.policy, env.num_envs):
             terminal = self._collect_steps(env, callback, rollout_buffer, n_rollout_steps, quota)
         if terminal is None:

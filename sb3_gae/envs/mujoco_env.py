@@ -128,6 +128,19 @@ class MujocoTaskEnv(gym.Env):
         mujoco.mj_forward(self.model, self.data)
         self._was_reset = True
 
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: what the next steps and resets depend on; of the task nothing, whose arguments are to be the same
+        """
+        return {"physics": self.physics_state[0].copy(), "np_random": self.np_random, "was_reset": self._was_reset}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: what :meth:`state_dict` returned, in this process or an earlier one
+        """
+        self.physics_state = state["physics"]
+        self.np_random, self._was_reset = state["np_random"], state["was_reset"]
+
     def _observation(self) -> np.ndarray:
         states = self.task.states(self.physics_state, self.data.ctrl[None], self.data.sensordata[None])
         return self.task.observations(states)[0].copy()

@@ -1,5 +1,6 @@
 """Many environments of one :class:`~sb3_gae.envs.MujocoTask`, stepped by one native call."""
 
+import copy
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, cast
@@ -14,6 +15,9 @@ from sb3_gae.envs.mujoco_env import MujocoTaskEnv
 from sb3_gae.envs.mujoco_task import MujocoTask, is_physical, total_reward
 from sb3_gae.vec_env.batched_vec_env import BatchedVecEnv, make_envs
 from sb3_gae.vec_env.wrappers import foreign_wrapper
+
+# Where the batch stands; all else is scratch, or belongs to the environments
+_STATE = ("_physics", "_lengths", "_returns", "_was_reset", "numerical_failures")
 
 
 class MujocoVecEnv(BatchedVecEnv):
@@ -107,6 +111,19 @@ class MujocoVecEnv(BatchedVecEnv):
             self._physics[env] = self._bases[env].physics_state[0]
             observations.append(observation)
         return np.stack(observations)
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        :return: what the next steps depend on, beside the state of the environments themselves
+        """
+        return {name: copy.deepcopy(getattr(self, name)) for name in _STATE}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        :param state: what :meth:`state_dict` returned, in this process or an earlier one
+        """
+        for name in _STATE:
+            setattr(self, name, copy.deepcopy(state[name]))
 
     def close(self) -> None:
         self._pool.close()
