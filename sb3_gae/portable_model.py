@@ -70,7 +70,7 @@ class PortableModel(OnPolicyAlgorithm):
         _check_size(policy_kwargs, file.tensors)
         policy = arguments.pop("policy", None)
         try:
-            model = cls(policy or _policy_for(env), env, device=device, **arguments)  # type: ignore[arg-type]
+            model = cls(policy or _policy_for(env), env, device=device, **arguments)
         except (MemoryError, TypeError, AssertionError, OverflowError) as error:
             raise ValueError(f"The settings in {path} make no model: {error}") from error
         try:
@@ -120,15 +120,19 @@ def _read_policy_kwargs(written: Any) -> dict[str, Any]:
             word = re.fullmatch(r"(?:<class 'torch\.nn\.modules\.activation\.)?(\w+)(?:'>)?", str(value))
             check_choice("activation_fn", word and word[1], tuple(_ACTIVATIONS))
             found[name] = _ACTIVATIONS[cast(re.Match[str], word)[1]]
-        elif (
-            (name == "net_arch" and all(map(_are_widths, value.values() if isinstance(value, dict) else [value])))
-            or (name in _FLAGS and isinstance(value, bool))
-            or (name == "log_std_init" and type(value) in (int, float))
-        ):
+        elif _is_plain_argument(name, value):
             found[name] = value
         else:
             raise ValueError(f"`policy_kwargs[{name!r}]` = {value!r} cannot be kept without pickle; use `save` and `load`.")
     return found
+
+
+def _is_plain_argument(name: str, value: Any) -> bool:
+    if name == "net_arch":
+        return all(map(_are_widths, value.values() if isinstance(value, dict) else [value]))
+    if name == "log_std_init":
+        return type(value) in (int, float)
+    return name in _FLAGS and isinstance(value, bool)
 
 
 def _are_widths(value: Any) -> bool:

@@ -1,5 +1,6 @@
 """Weights and settings travel without pickle, and no file of a stranger does anything but fit or be refused."""
 
+import base64
 import io
 import json
 import pickle
@@ -12,14 +13,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import SMALL, differing, state_of, train_once, vec_env
+from envs_for_tests import CHANNEL_FIRST, SMALL, VECTOR, AnySpacesEnv, differing, state_of, train_once, vec_env
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import PPO
 
 from sb3_gae import TRPOGAE, MlpPolicy
-from sb3_gae.weights_file import read_weights, weights_content
+from sb3_gae.weights_file import _FORMAT, _digest, read_weights, weights_content
 
 
 def trained(**kwargs: Any) -> TRPOGAE:
@@ -187,8 +188,6 @@ def test_what_a_file_of_save_could_execute_is_not(archive: bytes, tmp_path: Path
             for member in good.namelist():
                 found = good.read(member)
                 if member == where == "data":
-                    import base64
-
                     pickled = base64.b64encode(pickle.dumps(Bomb(str(mark)))).decode()
                     found = json.dumps(json.loads(found) | {"extra": {":type:": "x", ":serialized:": pickled}}).encode()
                 elif member == where:
@@ -337,8 +336,6 @@ def test_a_deeply_nested_header_is_refused() -> None:
     ],
 )
 def test_a_tensor_that_is_not_where_the_header_says_is_refused(entry: Any) -> None:
-    from sb3_gae.weights_file import _FORMAT, _digest
-
     data, settings = bytes(8), "{}"
     metadata = {"format": _FORMAT, "settings": settings, "sha256": _digest({"weight": entry}, settings, data)}
     header = json.dumps({"__metadata__": metadata, "weight": entry}).encode()
@@ -347,8 +344,6 @@ def test_a_tensor_that_is_not_where_the_header_says_is_refused(entry: Any) -> No
 
 
 def test_a_dictionary_of_observations_and_pictures_find_their_policy(tmp_path: Path) -> None:
-    from envs_for_tests import CHANNEL_FIRST, VECTOR, AnySpacesEnv
-
     for space, policy in ((spaces.Dict({"one": VECTOR}), "MultiInputPolicy"), (CHANNEL_FIRST, "CnnPolicy")):
         env = vec_env(lambda space=space: AnySpacesEnv(space))
         model = TRPOGAE(policy, env, n_steps=16, policy_kwargs=SMALL)
