@@ -18,9 +18,9 @@ class Controls:
     r"""
     :param gae_lambda: weight of longer estimates in [0, 1]
     :param gamma: discount factor in [0, 1]
-    :param value_function: what the estimator takes for :math:`V`: the policy's ``"exact"`` values; ``"learned"`` ones, the mean
-        returns of the last batch that visited a cell; ``"zero"``; ``"noisy"``, the exact ones with a fixed error in each
-        cell; or ``"frozen"``, the values in use when this was chosen
+    :param value_function: what the estimator takes for :math:`V`: the policy's ``"exact"`` values; ``"learned"`` ones, the
+        mean returns of the last batch that visited a cell; ``"zero"``; ``"noisy"``, the exact ones with a fixed error in
+        each cell; or ``"frozen"``, the values in use when this was chosen
     :param batch_size: episodes of a step, 1 to 200
     :param learning_rate: length of the ascent step in units of the gradient, in (0, 20]
     :param order: ``"policy_first"`` as in the paper, or ``"value_first"``, which lets a learned :math:`V` see the batch before

@@ -3,6 +3,8 @@
 from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from sb3_gae.lab.controls import Controls
 from sb3_gae.lab.moment import MAX_STEPS, Moment, first_moment
 from sb3_gae.lab.readings import Reading, light, read, status
@@ -16,6 +18,18 @@ class Event(NamedTuple):
 
     step: int
     text: str
+
+
+class Frame(NamedTuple):
+    """
+    What the grid showed at one step.
+
+    :param values: of the estimator, shape (S,)
+    :param probabilities: of the moves, shape (S, A)
+    """
+
+    values: np.ndarray
+    probabilities: np.ndarray
 
 
 CONTROL_NAMES = {
@@ -48,6 +62,7 @@ class Simulation:
         self.events: list[Event] = []
         #: of all moments so far, the present one last
         self.readings: list[Reading] = [read(self.moment)]
+        self.frames: list[Frame] = [self._frame()]
         self._since_change = 0
         self._light, self._status = "unbiased", self.status
         self._note_light()
@@ -73,6 +88,7 @@ class Simulation:
             self._log(f"episodes cut after {MAX_STEPS} steps: the policy goes round in circles")
         self.moment = self.moment.next()
         self.readings.append(read(self.moment))
+        self.frames.append(self._frame())
         self._note_light()
         self._note_status()
 
@@ -91,10 +107,13 @@ class Simulation:
         for name in turned:
             self._log_turn(CONTROL_NAMES[name], before[name], after[name])
         # A return under another γ is no gain, and a climb is judged by what the new controls do
-        self.readings[-1] = read(self.moment)
+        self.readings[-1], self.frames[-1] = read(self.moment), self._frame()
         self._since_change = len(self.readings) - 1
         self._status = self.status
         self._note_light()
+
+    def _frame(self) -> Frame:
+        return Frame(self.moment.values, self.moment.policy.probabilities)
 
     def _note_light(self) -> None:
         """Log that the light turned red or green; a slight bias in between is no event."""

@@ -1,0 +1,68 @@
+"""The page as a whole, and the server it comes from."""
+
+import socket
+from pathlib import Path
+
+import uvicorn
+from fastapi import FastAPI
+from nicegui import ui
+
+from sb3_gae.lab.page.gridworld_panel import GridworldPanel
+from sb3_gae.lab.page.rollout_panel import RolloutPanel
+from sb3_gae.lab.page.widgets import heading
+from sb3_gae.lab.rollout_view import RolloutViewer
+
+TITLE = "The λ dial"
+_STYLE = (Path(__file__).parent.parent / "style.css").read_text(encoding="utf-8")
+
+
+def serve(listening: socket.socket, viewer: RolloutViewer, show: str | None = None) -> None:
+    """
+    Serve the page until interrupted.
+
+    :param listening: bound to where the page is to be
+    :param viewer: of the rollout that the page begins with
+    :param show: address to open in a browser, None for no browser
+    """
+    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+
+    # A new one for each tab, so that none disturbs another
+    def page() -> None:
+        build_page(viewer)
+
+    ui.run_with(app, root=page, title=TITLE, dark=None, language="en-US", show_welcome_message=False, tailwind=False)
+    if show is not None:
+        _open_when_ready(app, show)
+    server = uvicorn.Server(uvicorn.Config(app, log_level="warning"))
+    server.run(sockets=[listening])
+
+
+def build_page(viewer: RolloutViewer) -> None:
+    """
+    :param viewer: of the rollout to begin with
+    """
+    ui.add_css(_STYLE)
+    theme = ui.dark_mode(None)
+    with ui.element("main").classes("lab") as main:
+        with ui.element("div").classes("row q-mb-sm").style("justify-content: space-between"):
+            heading("The λ dial: bias, variance and learning", 1)
+            choices = {"system": None, "light": False, "dark": True}
+            switch = ui.toggle(list(choices), value="system").props("dense no-caps flat aria-label=Theme data-test=theme")
+            switch.on_value_change(lambda event: theme.set_value(choices.get(event.value)))
+        with ui.tabs().props("no-caps align=left inline-label") as tabs:
+            grid = ui.tab("grid", label="Gridworld").props("data-test=tab-grid")
+            robot = ui.tab("robot", label="Recorded robot").props("data-test=tab-robot")
+        with ui.tab_panels(tabs, value=grid, animated=False).classes("w-full").style("background: transparent"):
+            with ui.tab_panel(grid).classes("q-px-none"):
+                GridworldPanel()
+            with ui.tab_panel(robot).classes("q-px-none"):
+                RolloutPanel(viewer)
+    ui.skip_link(target=main)
+
+
+def _open_when_ready(app: FastAPI, address: str) -> None:
+    import webbrowser
+
+    from nicegui import app as nicegui_app
+
+    nicegui_app.on_startup(lambda: webbrowser.open(address))
