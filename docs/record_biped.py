@@ -26,7 +26,7 @@ def main() -> None:
     environment.obs_rms = model.get_vec_normalize_env().obs_rms
     recorder = TRPOGAE("MlpPolicy", environment, n_steps=2_000, n_episodes=1, **SETTINGS)
     recorder.policy.load_state_dict(model.policy.state_dict())
-    recorder.learn(1, callback=SaveRolloutCallback(SHIPPED_ROLLOUT, name=f"GaeBiped-v0 after {N_STEPS:_} steps"))
+    recorder.learn(1, callback=SaveRolloutCallback(SHIPPED_ROLLOUT, name=f"GaeBiped-v0 after {N_STEPS // 1_000} 000 steps"))
 
 
 if __name__ == "__main__":

@@ -153,7 +153,9 @@ def _framed(axes: Axes, parts: Sequence[str]) -> str:
         frame.append(f'<line class="grid" {place}/>')
         frame.append(f'<text x="{_LEFT - 5}" y="{_y(axes, y) + 4:.1f}" text-anchor="end">{axes.y_format(y)}</text>')
     for x, anchor in zip(axes.x_range, ("start", "end"), strict=True):
-        frame.append(f'<text x="{_x(axes, x):.1f}" y="{HEIGHT - 6}" text-anchor="{anchor}">{x:g}</text>')
+        # Bars stand half a place further out than the first and the last number
+        shown = x + 0.5 if anchor == "start" and x % 1.0 else x - 0.5 if x % 1.0 else x
+        frame.append(f'<text x="{_x(axes, shown):.1f}" y="{HEIGHT - 6}" text-anchor="{anchor}">{shown:g}</text>')
     frame.append(f'<text x="{(_LEFT + WIDTH) / 2}" y="{HEIGHT - 6}" text-anchor="middle">{axes.x_label}</text>')
     content = "".join((*frame, *parts))
     return f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{axes.label}">{content}</svg>'

@@ -1,10 +1,13 @@
 """The page as a whole, and the server it comes from."""
 
 import socket
+import warnings
+import webbrowser
 from pathlib import Path
 
 import uvicorn
 from fastapi import FastAPI
+from nicegui import app as nicegui_app
 from nicegui import ui
 
 from sb3_gae.lab.page.gridworld_panel import GridworldPanel
@@ -14,6 +17,24 @@ from sb3_gae.lab.rollout_view import RolloutViewer
 
 TITLE = "The λ dial"
 _STYLE = (Path(__file__).parent.parent / "style.css").read_text(encoding="utf-8")
+
+# Quasar gives the role of a slider to an element that the keyboard never gets to; what does get the focus should speak
+_SPEAKING_SLIDERS = """<script>
+const spoken = ["aria-label", "aria-valuemin", "aria-valuemax", "aria-valuenow", "aria-orientation"];
+function say(element, name, text) {
+  // Only what is new: the observer sees this, too
+  if (text !== null && element.getAttribute(name) !== text) element.setAttribute(name, text);
+}
+function speak() {
+  for (const slider of document.querySelectorAll(".q-slider")) {
+    const focused = slider.querySelector(".q-slider__track-container");
+    say(focused, "role", "slider");
+    for (const name of spoken) say(focused, name, slider.getAttribute(name));
+    say(slider, "role", "presentation");
+  }
+}
+new MutationObserver(speak).observe(document, { subtree: true, childList: true, attributeFilter: ["role", ...spoken] });
+</script>"""
 
 
 def serve(listening: socket.socket, viewer: RolloutViewer, show: str | None = None) -> None:
@@ -32,9 +53,11 @@ def serve(listening: socket.socket, viewer: RolloutViewer, show: str | None = No
 
     ui.run_with(app, root=page, title=TITLE, dark=None, language="en-US", show_welcome_message=False, tailwind=False)
     if show is not None:
-        _open_when_ready(app, show)
+        nicegui_app.on_startup(lambda: webbrowser.open(show))
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning"))
-    server.run(sockets=[listening])
+    # NiceGUI looks through all objects of the process, and some of torch warn when they are looked at
+    with warnings.catch_warnings(action="ignore", category=FutureWarning):
+        server.run(sockets=[listening])
 
 
 def build_page(viewer: RolloutViewer) -> None:
@@ -42,9 +65,10 @@ def build_page(viewer: RolloutViewer) -> None:
     :param viewer: of the rollout to begin with
     """
     ui.add_css(_STYLE)
+    ui.add_head_html(_SPEAKING_SLIDERS)
     theme = ui.dark_mode(None)
     with ui.element("main").classes("lab") as main:
-        with ui.element("div").classes("row q-mb-sm").style("justify-content: space-between"):
+        with ui.element("div").classes("beside q-mb-sm").style("justify-content: space-between"):
             heading("The λ dial: bias, variance and learning", 1)
             choices = {"system": None, "light": False, "dark": True}
             switch = ui.toggle(list(choices), value="system").props("dense no-caps flat aria-label=Theme data-test=theme")
@@ -58,11 +82,3 @@ def build_page(viewer: RolloutViewer) -> None:
             with ui.tab_panel(robot).classes("q-px-none"):
                 RolloutPanel(viewer)
     ui.skip_link(target=main)
-
-
-def _open_when_ready(app: FastAPI, address: str) -> None:
-    import webbrowser
-
-    from nicegui import app as nicegui_app
-
-    nicegui_app.on_startup(lambda: webbrowser.open(address))

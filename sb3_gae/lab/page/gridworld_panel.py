@@ -31,16 +31,21 @@ class GridworldPanel:
         self._episode = self._start = 0
         self._timer = ui.timer(0.2, self._tick, active=False)
         self._build_presets()
+        self._build_run()
         with ui.element("div").classes("columns three"):
-            with ui.element("div").classes("column"):
-                self._build_run()
+            with ui.element("div").classes("stack"):
+                with panel("Return, in parts of the best possible (dashed)"):
+                    self._returns = picture()
                 self._grid = GridPanel(self._moment)
-            with ui.element("div").classes("column"):
-                self._build_charts()
-                self._build_log()
-            with ui.element("div").classes("column"):
+            with ui.element("div").classes("stack"):
                 self._build_knobs()
+                with panel("Bias: angle between expected and true gradient, in radians (exact)"):
+                    self._bias = picture()
+                with panel("Variance of the batch's gradient (exact)"):
+                    self._variance = picture()
+            with ui.element("div").classes("stack wide"):
                 self._build_estimator()
+                self._build_log()
         self.refresh()
 
     def refresh(self) -> None:
@@ -61,7 +66,7 @@ class GridworldPanel:
 
     def _build_presets(self) -> None:
         with panel("Presets"):
-            with ui.element("div").classes("row"):
+            with ui.element("div").classes("beside"):
                 self._preset_buttons = {
                     name: ui.button(preset.title, on_click=lambda name=name: self._load(name), color=None).props(
                         f"outline data-test=preset-{name}"
@@ -71,42 +76,32 @@ class GridworldPanel:
             self._story = ui.label("").classes("q-mt-sm")
 
     def _build_run(self) -> None:
-        with panel("The run"):
-            with ui.element("div").classes("row"):
-                self._play = ui.button("Play", icon="play_arrow", on_click=self._toggle, color=None).props(
-                    "outline data-test=play"
-                )
+        with panel("The run", titled=False) as run:
+            run.classes("sticky")
+            with ui.element("div").classes("beside"):
+                self._play = ui.button("Play", icon="play_arrow", on_click=self._toggle, color=None)
+                self._play.props("outline data-test=play")
                 ui.button("Step", icon="skip_next", on_click=self._step_once, color=None).props("outline data-test=step")
                 ui.button("Reset", icon="replay", on_click=self._reset, color=None).props("outline data-test=reset")
-                ui.button("Save as a page", icon="download", on_click=self._export, color=None).props(
-                    "outline data-test=export"
-                )
-            with ui.element("div").classes("readings q-my-sm") as readings:
-                readings.props["data-test"] = "readings"
-                self._step_count, self._return, self._v = ui.label(), ui.label(), ui.label()
-                self._light, self._noise, self._status = ui.label().classes("light"), ui.label(), ui.label()
-                self._share = ui.label()
+                with ui.element("div").classes("readings") as readings:
+                    readings.props["data-test"] = "readings"
+                    self._step_count, self._return, self._v = ui.label(), ui.label(), ui.label()
+                    self._light, self._noise, self._status = ui.label().classes("light"), ui.label(), ui.label()
             self._light.props["data-test"], self._status.props["data-test"] = "light", "status"
             self._step_count.props["data-test"] = "step-count"
-            Knob("speed, steps per second", 1, FASTEST, 1, 5, self._set_speed, "speed")
-
-    def _build_charts(self) -> None:
-        with panel("Return, in parts of the best possible (dashed)"):
-            self._returns = picture()
-        with panel("Bias: angle between expected and true gradient, in radians (exact)"):
-            self._bias = picture()
-        with panel("Variance of the batch's gradient (exact)"):
-            self._variance = picture()
 
     def _build_log(self) -> None:
         with panel("Event log"):
             self._log = ui.html("", sanitize=False).classes("log")
             self._log.props.update({"role": "log", "aria-live": "polite", "tabindex": "0", "aria-label": "Event log"})
             self._log.props["data-test"] = "log"
+            ui.button("Save the run as a page", icon="download", on_click=self._export, color=None).props(
+                "outline data-test=export"
+            ).classes("q-mt-sm")
 
     def _build_knobs(self) -> None:
         controls = self.simulation.controls
-        with panel("Knobs"), ui.element("div").classes("column"):
+        with panel("Knobs"), ui.element("div").classes("stack"):
             self._knobs = {
                 name: Knob(title, low, high, step, getattr(controls, name), self._turner(name), name)
                 for name, title, low, high, step in (
@@ -116,6 +111,7 @@ class GridworldPanel:
                     ("learning_rate", "learning rate", 0.5, 20.0, 0.5),
                 )
             }
+            Knob("speed, steps per second", 1, FASTEST, 1, 5, self._set_speed, "speed")
             kinds = {name: name for name in VALUE_FUNCTIONS}
             self._kind = choice("value function", kinds, "exact", self._turner("value_function"), "value_function")
             self._order = choice("order", ORDER_NAMES, "policy_first", self._turner("order"), "order")
@@ -129,6 +125,7 @@ class GridworldPanel:
             self._trace = picture()
             self._episode_knob = Knob("episode of the batch", 1, 20, 1, 1, self._choose_episode, "episode")
             self._start_knob = Knob("step of the episode", 0, 20, 1, 0, self._choose_start, "start")
+            self._share = ui.label("")
             self._sum = ui.html("", sanitize=False).classes("scrolls")
             self._sum.props.update({"tabindex": "0", "role": "region", "aria-label": "The sum of weighted residuals"})
 
@@ -143,7 +140,10 @@ class GridworldPanel:
         self._noise.text = f"variance {reading.variance:.3f} (exact)"
         self._status.text = self.simulation.status
         recent = [each.share_of_gradient for each in self.simulation.readings[-STALL_STEPS:]]
-        self._share.text = f"part of the true gradient in the batch's {np.mean(recent):.0%} (sampled, {len(recent)} steps)"
+        self._share.text = (
+            f"The gradients of the last {len(recent)} batches have {np.mean(recent):.0%} of the true one (sampled). "
+            "Unbiased estimates have 100 % on average."
+        )
         self._story.text = PRESETS[self._preset].story
         for name, button in self._preset_buttons.items():
             button.classes(**{"add" if name == self._preset else "remove": "chosen"})

@@ -22,10 +22,10 @@ class RolloutPanel:
         self._viewer, self._trajectory = viewer, 0
         self._gamma, self._gae_lambda = viewer.rollout.gamma, viewer.rollout.gae_lambda
         with ui.element("div").classes("columns"):
-            with ui.element("div").classes("column"):
+            with ui.element("div").classes("stack"):
                 self._build_controls()
                 self._build_advantages()
-            with ui.element("div").classes("column"):
+            with ui.element("div").classes("stack"):
                 self._build_statistics()
         self.refresh()
 
@@ -49,7 +49,7 @@ class RolloutPanel:
         )
 
     def _build_controls(self) -> None:
-        with panel("The rollout"), ui.element("div").classes("column"):
+        with panel("The rollout"), ui.element("div").classes("stack"):
             self._name = ui.label("")
             self._name.props["data-test"] = "rollout-name"
             self._lambda_knob = Knob("λ", 0.0, 1.0, 0.005, self._gae_lambda, self._turn_lambda, "rollout_lambda")

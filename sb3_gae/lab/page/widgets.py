@@ -75,14 +75,16 @@ def picture() -> ui.html:
 
 
 @contextmanager
-def panel(title: str) -> Iterator[ui.element]:
+def panel(title: str, titled: bool = True) -> Iterator[ui.element]:
     """
-    :param title: its heading
+    :param title: its name and heading
+    :param titled: whether the heading is shown
     :return: a section of the page
     """
     with ui.element("section").classes("panel") as section:
         section.props["aria-label"] = title
-        heading(title, 2)
+        if titled:
+            heading(title, 2)
         yield section
 
 
