@@ -1,6 +1,7 @@
 """The demonstration's model: the truth beside the estimate, determinism, what each control does, what is logged."""
 
 import math
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -131,6 +132,14 @@ def test_controls_change_a_run_and_are_logged_once_for_a_drag() -> None:
     texts = [event.text for event in simulation.events]
     assert texts[1:] == ["λ: 0 → 1", "bias went off (0.00 rad)"] or texts[1:] == ["bias went off (0.00 rad)", "λ: 0 → 1"]
     assert len(simulation.readings) == 2
+
+
+def test_a_turn_of_the_dial_takes_a_few_milliseconds() -> None:
+    simulation = run(Controls(0.0, value_function="zero"), 3)
+    start = time.process_time()
+    for step in range(20):
+        simulation.change(gae_lambda=step / 20)
+    assert (time.process_time() - start) / 20 < 0.02
 
 
 def test_status() -> None:

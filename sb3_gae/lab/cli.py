@@ -20,7 +20,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m sb3_gae.gridworld", description="Open the λ dial in a browser.")
     parser.add_argument("--host", default=DEFAULT_HOST, help="address to listen at (default: %(default)s, this machine only)")
-    parser.add_argument("--port", type=int, default=DEFAULT_PORT, help="port to listen at (default: %(default)s, 0 for a free one)")
+    parser.add_argument(
+        "--port", type=int, default=DEFAULT_PORT, help="port to listen at (default: %(default)s, 0 for a free one)"
+    )
     parser.add_argument("--no-browser", action="store_true", help="only serve the page, open nothing")
     parser.add_argument("--rollout", type=Path, default=SHIPPED_ROLLOUT, help="rollout saved by SaveRolloutCallback")
     options = parser.parse_args(arguments)

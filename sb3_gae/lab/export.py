@@ -35,4 +35,4 @@ def recorded_run(simulation: Simulation, title: str) -> str:
     text = json.dumps(data, ensure_ascii=True, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     page = (_FOLDER / "recorded_run.html").read_text(encoding="utf-8")
     style = (_FOLDER / "style.css").read_text(encoding="utf-8")
-    return page.replace("{{title}}", html.escape(title)).replace("/*{{style}}*/", style).replace("{{data}}", text)
+    return page.replace("{{title}}", html.escape(title, quote=False)).replace("/*{{style}}*/", style).replace("{{data}}", text)

@@ -140,7 +140,15 @@ class Moment:
         :return: the same moment under these controls; values that are to be frozen are those in use now
         """
         freezes = controls.value_function == "frozen" != self.controls.value_function
-        return replace(self, controls=controls, frozen=self.values.copy() if freezes else self.frozen)
+        moment = replace(self, controls=controls, frozen=self.values.copy() if freezes else self.frozen)
+        # A drag asks for the same things many times a second
+        kept = {"policy"}
+        if controls.batch_size == self.controls.batch_size:
+            kept.add("batch")
+        if controls.gamma == self.controls.gamma:
+            kept |= {"exact_values", "true_gradient"}
+        vars(moment).update({name: value for name, value in vars(self).items() if name in kept})
+        return moment
 
     def next(self) -> "Moment":
         """:return: after one policy-gradient ascent step and a fit of the learned values to the batch"""

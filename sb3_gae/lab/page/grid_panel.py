@@ -7,7 +7,7 @@ from nicegui import ui
 
 from sb3_gae.gridworld import MOVE_NAMES
 from sb3_gae.lab.moment import Moment, world
-from sb3_gae.lab.page.widgets import panel
+from sb3_gae.lab.page.widgets import panel, put
 from sb3_gae.lab.pictures import cell_arrows, favourite_move
 
 SIZE = 5
@@ -59,14 +59,12 @@ class GridPanel:
         values, probabilities = moment.values, moment.policy.probabilities
         for state, (button, arrows, number) in enumerate(self._cells):
             button.classes(replace=self._cell_classes(state))
-            button.props["aria-pressed"] = "true" if state == self.chosen else "false"
+            put(button, aria_pressed="true" if state == self.chosen else "false")
             if state in (GOAL, TRAP):
                 continue
             button.style(replace=cell_style(values[state]))
-            button.props["aria-label"] = (
-                f"{cell_name(state)}, value {values[state]:.2f}, favourite move {favourite_move(probabilities[state])} "
-                f"{probabilities[state].max():.0%}"
-            )
+            favourite = f"{favourite_move(probabilities[state])} {probabilities[state].max():.0%}"
+            put(button, aria_label=f"{cell_name(state)}, value {values[state]:.2f}, favourite move {favourite}")
             arrows.content = cell_arrows(probabilities[state])
             number.text = f"{values[state]:.2f}"
         self._details.content = cell_table(moment, self.chosen)

@@ -12,7 +12,7 @@ from sb3_gae.lab.export import recorded_run
 from sb3_gae.lab.moment import Moment
 from sb3_gae.lab.page.charts import bias_chart, return_chart, trace_chart, trace_table, variance_chart
 from sb3_gae.lab.page.grid_panel import GridPanel, cell_name
-from sb3_gae.lab.page.widgets import Knob, choice, panel, picture
+from sb3_gae.lab.page.widgets import Knob, choice, panel, picture, put
 from sb3_gae.lab.presets import PRESETS, load_preset
 from sb3_gae.lab.readings import STALL_STEPS, light
 
@@ -147,7 +147,7 @@ class GridworldPanel:
         self._story.text = PRESETS[self._preset].story
         for name, button in self._preset_buttons.items():
             button.classes(**{"add" if name == self._preset else "remove": "chosen"})
-            button.props["aria-pressed"] = "true" if name == self._preset else "false"
+            put(button, aria_pressed="true" if name == self._preset else "false")
 
     def _refresh_estimator(self) -> None:
         shown = trace(self._moment(), self._episode, self._start)

@@ -55,11 +55,11 @@ class RolloutPanel:
             self._lambda_knob = Knob("λ", 0.0, 1.0, 0.005, self._gae_lambda, self._turn_lambda, "rollout_lambda")
             self._gamma_knob = Knob("γ", 0.8, 1.0, 0.005, self._gamma, self._turn_gamma, "rollout_gamma")
             self._trajectory_knob = Knob("trajectory", 1, 2, 1, 1, self._choose, "trajectory")
-            upload = ui.upload(
+            self._upload = ui.upload(
                 label="Load a rollout (.npz)", auto_upload=True, max_file_size=MAX_BYTES, max_files=1, on_upload=self._load,
                 on_rejected=lambda: ui.notify(f"Refused: not one file of at most {MAX_BYTES // 2**20} MiB.", type="negative"),
             )  # fmt: skip
-            upload.props('accept=".npz" flat bordered data-test=upload').classes("w-full")
+            self._upload.props('accept=".npz" flat bordered data-test=upload').classes("w-full")
             ui.label("Files come from SaveRolloutCallback in training.").classes("faint")
             self._complaint = ui.label("").classes("light biased")
             self._complaint.props.update({"role": "alert", "data-test": "complaint"})
@@ -105,10 +105,17 @@ class RolloutPanel:
         except ValueError as error:
             self._complaint.text = f"Refused: {error}"
             return
+        finally:
+            # Else it counts as the one file that may be loaded
+            self._upload.reset()
         self._complaint.text = ""
         self._viewer, self._trajectory = viewer, 0
         self._gamma, self._gae_lambda = viewer.rollout.gamma, viewer.rollout.gae_lambda
-        for knob, value in ((self._trajectory_knob, 1), (self._gamma_knob, self._gamma), (self._lambda_knob, self._gae_lambda)):
+        for knob, value in (
+            (self._trajectory_knob, 1),
+            (self._gamma_knob, self._gamma),
+            (self._lambda_knob, self._gae_lambda),
+        ):
             knob.set(value)
         self.refresh()
 

@@ -30,6 +30,9 @@ class Knob:
             self.slider = ui.slider(min=low, max=high, step=step, value=value, on_change=lambda event: self._turn(event.value))
             self.slider.props["aria-label"] = name
             self.slider.props["data-test"] = marker
+        # Quasar's slider knows the arrows and page keys only
+        self.slider.on("keydown.home", lambda: self.slider.set_value(low))
+        self.slider.on("keydown.end", lambda: self.slider.set_value(self.slider.props["max"]))
         self._on_change = on_change
 
     def set(self, value: float) -> None:
@@ -67,6 +70,19 @@ def choice(name: str, options: dict[str, str], value: str, on_change: Callable[[
         radio.props["aria-label"] = name
         radio.props["data-test"] = marker
     return radio
+
+
+def put(element: ui.element, **props: Any) -> None:
+    """
+    Change properties, and tell the page only if they are new.
+
+    :param element: any
+    :param props: names, with _ for -, and values
+    """
+    new = {name.replace("_", "-"): value for name, value in props.items()}
+    new = {name: value for name, value in new.items() if element.props.get(name) != value}
+    if new:
+        element.props.update(new)
 
 
 def picture() -> ui.html:
