@@ -11,6 +11,7 @@ import struct
 import zipfile
 import zlib
 from dataclasses import dataclass
+from typing import IO
 
 import numpy as np
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -156,7 +157,7 @@ def _read(content: bytes) -> dict[str, np.ndarray]:
         return {name: file[name] for name in _ARRAYS}
 
 
-def _check_header(name: str, member: io.BufferedIOBase, size: int, kind: str, n_axes: int) -> None:
+def _check_header(name: str, member: IO[bytes], size: int, kind: str, n_axes: int) -> None:
     """Refuse what is not the array that it should be, by its description alone."""
     if np.lib.format.read_magic(member) != (1, 0):
         raise ValueError(f"{name} is not in NumPy's format 1.0")

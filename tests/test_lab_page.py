@@ -1,8 +1,6 @@
 """The page in a real browser. Skipped where chromium or its driver is not there."""
 
-import importlib.util
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -11,19 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-if importlib.util.find_spec("nicegui") is None or importlib.util.find_spec("selenium") is None:
-    pytest.skip("NiceGUI and Selenium are needed: pip install -e '.[lab,tests]'", allow_module_level=True)
-CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-if CHROMIUM is None or DRIVER is None:
-    pytest.skip("chromium and chromedriver are needed: apt install chromium chromium-driver", allow_module_level=True)
-
-from selenium import webdriver
-from selenium.webdriver.common.action_chains import ActionChains
-from selenium.webdriver.common.by import By
-from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.remote.webelement import WebElement
-from selenium.webdriver.support.ui import WebDriverWait
+from browser import CHROMIUM, DRIVER, By, Keys, WebDriverWait, WebElement, webdriver
 
 from sb3_gae.lab.export import recorded_run
 from sb3_gae.lab.presets import PRESETS, load_preset
@@ -115,9 +101,11 @@ def test_the_seeds_own_instructions(page: webdriver.Chrome) -> None:
     # Drag the dial up to 1: the bias falls, the climb restarts
     dial = slider(page, "gae_lambda")
     page.execute_script("arguments[0].scrollIntoView({block: 'center'})", dial)
-    ActionChains(page).move_to_element_with_offset(dial, -dial.size["width"] // 2 + 2, 0).click_and_hold().move_by_offset(
-        dial.size["width"] // 2, 0
-    ).move_by_offset(dial.size["width"] // 2 + 40, 0).release().perform()
+    webdriver.ActionChains(page).move_to_element_with_offset(
+        dial, -dial.size["width"] // 2 + 2, 0
+    ).click_and_hold().move_by_offset(dial.size["width"] // 2, 0).move_by_offset(
+        dial.size["width"] // 2 + 40, 0
+    ).release().perform()
     wait(page, lambda: "unbiased (0.00)" in text(page, "light"))
     assert "unbiased" in find(page, "light").get_attribute("class").split()
     press(page, "play")

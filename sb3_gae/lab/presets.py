@@ -30,8 +30,8 @@ PRESETS = {
     "broken_v": Preset(
         "One-step on a broken V",
         "λ is 0 and the value function says zero everywhere, so a move is judged by its own reward alone. Press play: the "
-        "bias light is red and the return stalls far below the dashed ceiling. Then drag λ up to 1: the bias falls and the climb "
-        "restarts, although V is as broken as before.",
+        "bias light is red and the return stalls far below the dashed ceiling. Then drag λ up to 1: the bias falls and the "
+        "climb restarts, although V is as broken as before.",
         Controls(gae_lambda=0.0, value_function="zero", batch_size=20, learning_rate=4.0),
     ),
     "monte_carlo": Preset(

@@ -51,7 +51,9 @@ def serve(listening: socket.socket, viewer: RolloutViewer, show: str | None = No
     def page() -> None:
         build_page(viewer)
 
-    ui.run_with(app, root=page, title=TITLE, dark=None, language="en-US", show_welcome_message=False, tailwind=False)
+    # A run survives a network that is away for a while
+    looks = dict(title=TITLE, dark=None, language="en-US", tailwind=False)
+    ui.run_with(app, root=page, show_welcome_message=False, reconnect_timeout=30.0, **looks)  # type: ignore[arg-type]
     if show is not None:
         nicegui_app.on_startup(lambda: webbrowser.open(show))
     server = uvicorn.Server(uvicorn.Config(app, log_level="warning"))

@@ -20,6 +20,8 @@ LIGHTS = {"unbiased": "●", "slight": "▲", "biased": "■"}
 LIGHT_NAMES = {"unbiased": "unbiased", "slight": "slightly biased", "biased": "biased"}
 ORDER_NAMES = {"policy_first": "policy step first (as in the paper)", "value_first": "value fit first"}
 FASTEST, MAX_RUN = 20, 2_000
+# Seconds without an answer after which nobody seems to be looking
+_LONGEST_WAIT = 20.0
 
 
 class GridworldPanel:
@@ -185,7 +187,15 @@ class GridworldPanel:
         self._kind.value, self._order.value = controls.value_function, controls.order
         self.refresh()
 
-    def _tick(self) -> None:
+    async def _tick(self) -> None:
+        self._advance()
+        # A browser that is slower than the speed asked for would fall behind without end; the next step waits for it
+        try:
+            await ui.run_javascript("return true", timeout=_LONGEST_WAIT)
+        except TimeoutError:
+            self._pause()
+
+    def _advance(self) -> None:
         if self.simulation.reading.step >= MAX_RUN:
             self._pause()
             ui.notify(f"Paused after {MAX_RUN} steps; reset to start anew.")
@@ -195,7 +205,7 @@ class GridworldPanel:
 
     def _step_once(self) -> None:
         self._pause()
-        self._tick()
+        self._advance()
 
     def _toggle(self) -> None:
         if self._timer.active:
