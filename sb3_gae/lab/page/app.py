@@ -56,7 +56,7 @@ def serve(listening: socket.socket, viewer: RolloutViewer, show: str | None = No
     ui.run_with(app, root=page, show_welcome_message=False, reconnect_timeout=30.0, **looks)  # type: ignore[arg-type]
     if show is not None:
         nicegui_app.on_startup(lambda: webbrowser.open(show))
-    server = uvicorn.Server(uvicorn.Config(app, log_level="warning"))
+    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=2))
     # NiceGUI looks through all objects of the process, and some of torch warn when they are looked at
     with warnings.catch_warnings(action="ignore", category=FutureWarning):
         server.run(sockets=[listening])
