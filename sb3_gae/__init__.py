@@ -5,7 +5,7 @@ The paper: Schulman et al., High-Dimensional Continuous Control Using Generalize
 arXiv 1506.02438.
 """
 
-from sb3_gae.callbacks import GradientDiagnosticsCallback, LambdaSweepCallback
+from sb3_gae.callbacks import GradientDiagnosticsCallback, LambdaSweepCallback, SaveRolloutCallback
 from sb3_gae.checkpoint_callback import ResumableCheckpointCallback
 from sb3_gae.envs import register_tasks
 from sb3_gae.errors import NumericalError
@@ -38,5 +38,6 @@ __all__ = [
     "MultiInputPolicy",
     "NumericalError",
     "ResumableCheckpointCallback",
+    "SaveRolloutCallback",
     "SharedMlpPolicy",
 ]

@@ -1,0 +1,1 @@
+"""The page of the λ dial, on NiceGUI (extra ``lab``)."""

@@ -1,0 +1,86 @@
+"""The page as a whole, and the server it comes from."""
+
+import socket
+import warnings
+import webbrowser
+from pathlib import Path
+
+import uvicorn
+from fastapi import FastAPI
+from nicegui import app as nicegui_app
+from nicegui import ui
+
+from sb3_gae.lab.page.gridworld_panel import GridworldPanel
+from sb3_gae.lab.page.rollout_panel import RolloutPanel
+from sb3_gae.lab.page.widgets import heading
+from sb3_gae.lab.rollout_view import RolloutViewer
+
+TITLE = "The λ dial"
+_STYLE = (Path(__file__).parent.parent / "style.css").read_text(encoding="utf-8")
+
+# Quasar gives the role of a slider to an element that the keyboard never gets to; what does get the focus should speak
+_SPEAKING_SLIDERS = """<script>
+const spoken = ["aria-label", "aria-valuemin", "aria-valuemax", "aria-valuenow", "aria-orientation"];
+function say(element, name, text) {
+  // Only what is new: the observer sees this, too
+  if (text !== null && element.getAttribute(name) !== text) element.setAttribute(name, text);
+}
+function speak() {
+  for (const slider of document.querySelectorAll(".q-slider")) {
+    const focused = slider.querySelector(".q-slider__track-container");
+    say(focused, "role", "slider");
+    for (const name of spoken) say(focused, name, slider.getAttribute(name));
+    say(slider, "role", "presentation");
+  }
+}
+new MutationObserver(speak).observe(document, { subtree: true, childList: true, attributeFilter: ["role", ...spoken] });
+</script>"""
+
+
+def serve(listening: socket.socket, viewer: RolloutViewer, show: str | None = None) -> None:
+    """
+    Serve the page until interrupted.
+
+    :param listening: bound to where the page is to be
+    :param viewer: of the rollout that the page begins with
+    :param show: address to open in a browser, None for no browser
+    """
+    app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+
+    # A new one for each tab, so that none disturbs another
+    def page() -> None:
+        build_page(viewer)
+
+    # A run survives a network that is away for a while
+    looks = dict(title=TITLE, dark=None, language="en-US", tailwind=False)
+    ui.run_with(app, root=page, show_welcome_message=False, reconnect_timeout=30.0, **looks)  # type: ignore[arg-type]
+    if show is not None:
+        nicegui_app.on_startup(lambda: webbrowser.open(show))
+    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=2))
+    # NiceGUI looks through all objects of the process, and some of torch warn when they are looked at
+    with warnings.catch_warnings(action="ignore", category=FutureWarning):
+        server.run(sockets=[listening])
+
+
+def build_page(viewer: RolloutViewer) -> None:
+    """
+    :param viewer: of the rollout to begin with
+    """
+    ui.add_css(_STYLE)
+    ui.add_head_html(_SPEAKING_SLIDERS)
+    theme = ui.dark_mode(None)
+    with ui.element("main").classes("lab") as main:
+        with ui.element("div").classes("beside q-mb-sm").style("justify-content: space-between"):
+            heading("The λ dial: bias, variance and learning", 1)
+            choices = {"system": None, "light": False, "dark": True}
+            switch = ui.toggle(list(choices), value="system").props("dense no-caps flat aria-label=Theme data-test=theme")
+            switch.on_value_change(lambda event: theme.set_value(choices.get(event.value)))
+        with ui.tabs().props("no-caps align=left inline-label") as tabs:
+            grid = ui.tab("grid", label="Gridworld").props("data-test=tab-grid")
+            robot = ui.tab("robot", label="Recorded robot").props("data-test=tab-robot")
+        with ui.tab_panels(tabs, value=grid, animated=False).classes("w-full").style("background: transparent"):
+            with ui.tab_panel(grid).classes("q-px-none"):
+                GridworldPanel()
+            with ui.tab_panel(robot).classes("q-px-none"):
+                RolloutPanel(viewer)
+    ui.skip_link(target=main)

@@ -1,0 +1,162 @@
+"""The robot's part of the page: one recorded rollout, γ and λ."""
+
+from typing import Any
+
+import numpy as np
+from nicegui import events, ui
+
+from sb3_gae.lab.page.widgets import Knob, panel, picture
+from sb3_gae.lab.pictures import Axes, Line, bar_chart, line_chart, round_up
+from sb3_gae.lab.rollout_view import RolloutViewer, View
+from sb3_gae.rollout_file import MAX_BYTES, load_rollout
+
+
+class RolloutPanel:
+    """
+    Builds itself into the page at hand.
+
+    :param viewer: of the rollout to begin with
+    """
+
+    def __init__(self, viewer: RolloutViewer):
+        self._viewer, self._trajectory = viewer, 0
+        self._gamma, self._gae_lambda = viewer.rollout.gamma, viewer.rollout.gae_lambda
+        with ui.element("div").classes("columns"):
+            with ui.element("div").classes("stack"):
+                self._build_controls()
+                self._build_advantages()
+            with ui.element("div").classes("stack"):
+                self._build_statistics()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Show the rollout with the factors as they are."""
+        view = self._viewer.view(self._gamma, self._gae_lambda)
+        rollout = self._viewer.rollout
+        self._name.text = (
+            f"{rollout.name}: {int(rollout.mask.sum())} steps in {self._viewer.n_trajectories} trajectories, "
+            f"collected with γ = {rollout.gamma:g} and λ = {rollout.gae_lambda:g}"
+        )
+        self._trajectory_knob.set_high(self._viewer.n_trajectories)
+        self._advantages.content = advantage_chart(view, self._viewer.steps(self._trajectory))
+        self._trade_off.content = trade_off_chart(view)
+        self._response.content = response_chart(*self._viewer.response(self._gamma), self._gamma * self._gae_lambda)
+        bias, variance = view.bias_squared, view.variance
+        self._summary.text = (
+            f"At λ = {self._gae_lambda:g}: bias² {bias.value[-1]:.3f} ± {bias.standard_error[-1]:.3f}, "
+            f"variance {variance.value[-1]:.3f} ± {variance.standard_error[-1]:.3f} of what it is at λ = 1 (estimated from "
+            "this rollout alone)"
+        )
+
+    def _build_controls(self) -> None:
+        with panel("The rollout"), ui.element("div").classes("stack"):
+            self._name = ui.label("")
+            self._name.props["data-test"] = "rollout-name"
+            self._lambda_knob = Knob("λ", 0.0, 1.0, 0.005, self._gae_lambda, self._turn_lambda, "rollout_lambda")
+            self._gamma_knob = Knob("γ", 0.8, 1.0, 0.005, self._gamma, self._turn_gamma, "rollout_gamma")
+            self._trajectory_knob = Knob("trajectory", 1, 2, 1, 1, self._choose, "trajectory")
+            self._upload = ui.upload(
+                label="Load a rollout (.npz)", auto_upload=True, max_file_size=MAX_BYTES, max_files=1, on_upload=self._load,
+                on_rejected=lambda: ui.notify(f"Refused: not one file of at most {MAX_BYTES // 2**20} MiB.", type="negative"),
+            )  # fmt: skip
+            self._upload.props('accept=".npz" flat bordered data-test=upload').classes("w-full")
+            ui.label("Files come from SaveRolloutCallback in training.").classes("faint")
+            self._complaint = ui.label("").classes("light biased")
+            self._complaint.props.update({"role": "alert", "data-test": "complaint"})
+            self._complaint.style("white-space: normal")
+
+    def _build_advantages(self) -> None:
+        with panel("Advantages along the trajectory"):
+            ui.label("Line: with the λ of the dial. Dashed: with λ = 1. Bars: residuals δ.").classes("faint")
+            self._advantages = picture()
+
+    def _build_statistics(self) -> None:
+        with panel("Bias² (solid) and variance (dashed) of the batch's policy gradient for each λ"):
+            self._trade_off = picture()
+            self._summary = ui.label("").classes("faint")
+            self._summary.props["data-test"] = "rollout-summary"
+        with panel("Response of the policy gradient by delay"):
+            ui.label(
+                "‖E[∇log π · x at l steps later]‖²: what remains of the response function χ(l) where states do not recur. "
+                "Slate: rewards. Clay: residuals, which V has shaped. Curve: the weights (γλ)^l. Each in units of its largest."
+            ).classes("faint")
+            self._response = picture()
+
+    def _turn_lambda(self, value: Any) -> None:
+        if isinstance(value, int | float) and 0.0 <= value <= 1.0:
+            self._gae_lambda = float(value)
+            self.refresh()
+
+    def _turn_gamma(self, value: Any) -> None:
+        if isinstance(value, int | float) and 0.0 <= value <= 1.0:
+            self._gamma = float(value)
+            self.refresh()
+
+    def _choose(self, value: Any) -> None:
+        if isinstance(value, int | float) and 1 <= value <= self._viewer.n_trajectories:
+            self._trajectory = int(value) - 1
+            self.refresh()
+
+    async def _load(self, event: events.UploadEventArguments) -> None:
+        try:
+            if event.file.size() > MAX_BYTES:
+                raise ValueError(f"The file must not exceed {MAX_BYTES // 2**20} MiB.")
+            viewer = RolloutViewer(load_rollout(await event.file.read()))
+        except ValueError as error:
+            self._complaint.text = f"Refused: {error}"
+            return
+        finally:
+            # Else it counts as the one file that may be loaded
+            self._upload.reset()
+        self._complaint.text = ""
+        self._viewer, self._trajectory = viewer, 0
+        self._gamma, self._gae_lambda = viewer.rollout.gamma, viewer.rollout.gae_lambda
+        for knob, value in (
+            (self._trajectory_knob, 1),
+            (self._gamma_knob, self._gamma),
+            (self._lambda_knob, self._gae_lambda),
+        ):
+            knob.set(value)
+        self.refresh()
+
+
+def advantage_chart(view: View, steps: tuple[np.ndarray, np.ndarray]) -> str:
+    """
+    :param view: of the rollout
+    :param steps: of the trajectory, as indices
+    :return: advantages with the chosen and the unbiased λ, over the residuals
+    """
+    curves = [array[steps] for array in (view.advantages, view.unbiased, view.deltas)]
+    places, top = np.arange(len(curves[0])), round_up(max(float(np.abs(curve).max()) for curve in curves))
+    axes = Axes("Advantages along the trajectory", (-0.5, len(places) - 0.5), (-top, top), x_label="step of the trajectory")
+    lines = [Line(places, curves[1], "optimum"), Line(places, curves[0], "bias")]
+    return bar_chart(axes, [curves[2]], ["delta"], lines)
+
+
+def trade_off_chart(view: View) -> str:
+    """
+    :param view: of the rollout
+    :return: bias² and variance over the λ of the grid, the chosen one marked
+    """
+    order = np.argsort(view.lambdas, kind="stable")
+    # λ between 0.9 and 1 is where things happen: places by the logarithm of the horizon
+    places = -np.log(1.0 - 0.99 * view.lambdas) / np.log(100.0)
+    axes = Axes(
+        "Bias squared and variance for each λ", (0.0, 1.0), (0.0, 1.0), x_label="λ from 0 to 1, places by log of the horizon"
+    )
+    bias = Line(places[order], np.maximum(view.bias_squared.value[order], 0.0), "bias")
+    variance = Line(places[order], view.variance.value[order], "variance")
+    return line_chart(axes, [bias, variance], marks=[float(places[-1])])
+
+
+def response_chart(rewards: np.ndarray, shaped: np.ndarray, decay: float) -> str:
+    """
+    :param rewards: response of the rewards by delay
+    :param shaped: response of the residuals
+    :param decay: γλ
+    :return: bars of both and the weights
+    """
+    n_lags = len(shaped)
+    axes = Axes("Response by delay, of rewards and of residuals", (-0.5, n_lags - 0.5), (-1.0, 1.0), x_label="delay l")
+    curve = Line(np.arange(n_lags), decay ** np.arange(n_lags), "weights")
+    return bar_chart(axes, [rewards, shaped], ["delta", "weighted"], [curve])

@@ -1,0 +1,116 @@
+"""Pieces that both parts of the page are made of."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from nicegui import ui
+
+
+class Knob:
+    """
+    A slider under its name and value.
+
+    :param name: as it is shown, and said by a screen reader
+    :param low: end of the slider
+    :param high: end of the slider
+    :param step: of the slider
+    :param value: to begin with
+    :param on_change: called with the new value, also while it is dragged
+    :param marker: for tests, to find it by
+    """
+
+    def __init__(
+        self, name: str, low: float, high: float, step: float, value: float, on_change: Callable[[Any], None], marker: str
+    ):
+        with ui.element("div").classes("w-full"):
+            with ui.element("div").classes("knob-name"):
+                ui.label(name)
+                self._shown = ui.label(f"{value:g}")
+            self.slider = ui.slider(min=low, max=high, step=step, value=value, on_change=lambda event: self._turn(event.value))
+            self.slider.props["aria-label"] = name
+            self.slider.props["data-test"] = marker
+        # Quasar's slider knows the arrows and page keys only
+        self.slider.on("keydown.home", lambda: self.slider.set_value(low))
+        self.slider.on("keydown.end", lambda: self.slider.set_value(self.slider.props["max"]))
+        self._on_change = on_change
+
+    def set(self, value: float) -> None:
+        """
+        :param value: to show; the page is told as if it had been dragged there
+        """
+        self.slider.value = value
+        self._shown.text = f"{value:g}"
+
+    def set_high(self, high: float) -> None:
+        """
+        :param high: new end of the slider
+        """
+        if self.slider.props["max"] != high:
+            self.slider.props["max"] = high
+
+    def _turn(self, value: Any) -> None:
+        if isinstance(value, int | float):
+            self._shown.text = f"{value:g}"
+        self._on_change(value)
+
+
+def choice(name: str, options: dict[str, str], value: str, on_change: Callable[[Any], None], marker: str) -> ui.radio:
+    """
+    :param name: of the group
+    :param options: values and their labels
+    :param value: to begin with
+    :param on_change: called with the new value
+    :param marker: for tests, to find it by
+    :return: radio buttons
+    """
+    with ui.element("div").classes("w-full"):
+        ui.label(name).classes("knob-name")
+        radio = ui.radio(options, value=value, on_change=lambda event: on_change(event.value)).props("inline dense")
+        radio.props["aria-label"] = name
+        radio.props["data-test"] = marker
+    return radio
+
+
+def put(element: ui.element, **props: Any) -> None:
+    """
+    Change properties, and tell the page only if they are new.
+
+    :param element: any
+    :param props: names, with _ for -, and values
+    """
+    new = {name.replace("_", "-"): value for name, value in props.items()}
+    new = {name: value for name, value in new.items() if element.props.get(name) != value}
+    if new:
+        element.props.update(new)
+
+
+def picture() -> ui.html:
+    """:return: a place for the SVG of :mod:`sb3_gae.lab.pictures`, which needs no sanitizing as it is made of numbers"""
+    return ui.html("", sanitize=False).classes("w-full")
+
+
+@contextmanager
+def panel(title: str, titled: bool = True) -> Iterator[ui.element]:
+    """
+    :param title: its name and heading
+    :param titled: whether the heading is shown
+    :return: a section of the page
+    """
+    with ui.element("section").classes("panel") as section:
+        section.props["aria-label"] = title
+        if titled:
+            heading(title, 2)
+        yield section
+
+
+def heading(text: str, level: int) -> ui.element:
+    """
+    :param text: of the heading
+    :param level: 1 or 2
+    :return: the element
+    """
+    element = ui.element(f"h{level}")
+    with element:
+        ui.label(text)
+    return element
