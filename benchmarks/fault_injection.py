@@ -354,6 +354,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--write", type=Path, help="Markdown file for the tally")
     chosen = parser.parse_args(arguments)
     th.set_num_threads(1)
+    # A shell lets what it runs in the background ignore it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     out = io.StringIO()
     print("| fault | tried | survived | lost |\n| --- | --: | --: | --: |", file=out)
     n_lost = 0

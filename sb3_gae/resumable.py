@@ -22,7 +22,7 @@ class ResumableModel(SavedModel):
     """To be inherited before an algorithm of SB3."""
 
     #: names of attributes that no file keeps
-    _of_the_process: ClassVar[tuple[str, ...]] = ("_end_of_learning", "_resumed")
+    _of_the_process: ClassVar[tuple[str, ...]] = ("_end_of_learning", "_resumed", "learn")
 
     _end_of_learning: ExitStack | None = None
     _resumed: dict[str, Any] | None = None
@@ -78,6 +78,11 @@ class ResumableModel(SavedModel):
     def remaining_timesteps(self) -> int:
         """What is left of the last ``learn``, to be given to the next after :meth:`resume`."""
         return max(0, self._total_timesteps - self.num_timesteps)
+
+    @property
+    def is_resumed(self) -> bool:
+        """Whether :meth:`resume` made this model and it has not learnt since with a callback that knows of it."""
+        return self._resumed is not None
 
     def take_resumed(self) -> dict[str, Any] | None:
         """

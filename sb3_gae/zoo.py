@@ -21,6 +21,7 @@ from torch import nn
 from sb3_gae.trpo_gae import TRPOGAE
 from sb3_gae.zoo_hub_repairs import repair_hub_verbs
 from sb3_gae.zoo_keys import METHODS_WITH_KEYS, add_keys
+from sb3_gae.zoo_resume import METHODS_THAT_RESUME, add_resuming
 
 if TYPE_CHECKING:
     import optuna
@@ -127,7 +128,7 @@ def _add_default_hyperparams(exp_manager: ModuleType) -> None:
     signature = inspect.signature(original)
     if not {"algo", "config"} <= signature.parameters.keys():
         raise UnsupportedZooError(f"{exp_manager.__name__}.{manager.__name__}(algo, config)")
-    for name in METHODS_WITH_KEYS:
+    for name in (*METHODS_WITH_KEYS, *METHODS_THAT_RESUME):
         if not callable(getattr(manager, name, None)):
             raise UnsupportedZooError(f"{exp_manager.__name__}.{manager.__name__}.{name}")
 
@@ -140,6 +141,7 @@ def _add_default_hyperparams(exp_manager: ModuleType) -> None:
 
     manager.__init__ = _mark_as_ours(init_with_our_default)
     add_keys(manager)
+    add_resuming(manager, TRPOGAE, ALGO)
 
 
 INTEGRATIONS: dict[str, Callable[[ModuleType], None]] = {
