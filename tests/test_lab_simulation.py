@@ -62,6 +62,18 @@ def test_a_preset_gives_the_same_run_step_for_step(name: str) -> None:
     assert first.readings == second.readings and first.events == second.events
 
 
+def test_a_run_depends_on_the_controls_of_its_steps_and_not_on_what_they_were_between() -> None:
+    straight, dragged = Simulation(Controls(0.5, batch_size=3)), Simulation(Controls(0.96, 0.9, "zero", batch_size=7))
+    for changes in (dict(gae_lambda=0.1), dict(batch_size=3), dict(gamma=0.95), dict(value_function="exact")):
+        dragged.change(**changes)
+        assert dragged.moment.batch.states.shape[1] == dragged.controls.batch_size
+    dragged.change(gae_lambda=0.5)
+    for _ in range(2):
+        straight.step(), dragged.step()
+    np.testing.assert_array_equal(straight.moment.logits, dragged.moment.logits)
+    assert straight.readings[1:] == dragged.readings[1:]
+
+
 def test_another_seed_gives_another_run() -> None:
     assert run(Controls(), 2, seed=0).readings[1:] != run(Controls(), 2, seed=1).readings[1:]
 
