@@ -83,8 +83,9 @@ arguments = st.fixed_dictionaries(
         "gamma": st.sampled_from([0.0, 0.9, 1.0]),
         "gae_lambda": st.sampled_from([0.0, 0.95, 1.0]),
         "value_lambda": st.sampled_from([None, 0.0, 1.0]),
-        "target_kl": st.sampled_from([1e-6, 0.01, 1.0]),
-        "vf_trust_region": st.sampled_from([1e-6, 0.2, 10.0]),
+        # Not smaller: a divergence of 1e-6 is known to a part in a hundred only, in single precision
+        "target_kl": st.sampled_from([1e-3, 0.01, 1.0]),
+        "vf_trust_region": st.sampled_from([1e-3, 0.2, 10.0]),
         "cg_damping": st.sampled_from([0.0, 0.1]),
         "line_search_max_iter": st.sampled_from([1, 10]),
         "normalize_value": st.booleans(),
