@@ -5,7 +5,6 @@ import os
 import signal
 import threading
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -41,14 +40,6 @@ def train(folder: Path, iterations: int = 3, **kwargs: Any) -> TRPOGAE:
 
 def steps_in(folder: Path) -> list[int]:
     return [int(path.name.split("_")[-2]) // STEPS for path in checkpoints_in(folder)]
-
-
-@pytest.fixture(autouse=True)
-def interruptible() -> Iterator[None]:
-    """A shell has its background jobs ignore Ctrl-C, and tests may be one."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(scope="module")
