@@ -4,7 +4,7 @@ Prints the tables of docs/why-it-works.md: what becomes of the policy gradient i
     python docs/measured_lambda.py
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from gridworld_figures import GAMMA, half_trained_policy, value_functions
@@ -23,18 +23,26 @@ CRITERIA: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def exact(policy: TabularPolicy, values: np.ndarray, n_episodes: int) -> np.ndarray:
+def exact(
+    policy: TabularPolicy, values: np.ndarray, n_episodes: int, lambdas: Sequence[float | np.ndarray] = PAPER_LAMBDAS
+) -> np.ndarray:
     """:return: bias squared, variance, squared norm and product with the true gradient, for each λ, shape (4, L)"""
     truth = policy.true_gradient(GAMMA)
-    moments = [policy.gradient_moments(values, GAMMA, gae_lambda) for gae_lambda in PAPER_LAMBDAS]
+    moments = [policy.gradient_moments(values, GAMMA, gae_lambda) for gae_lambda in lambdas]
     means, variances = np.stack([each.mean for each in moments]), np.array([each.variance for each in moments])
     over = (1, 2)
     norms, products = np.square(means).sum(axis=over), (means * truth).sum(axis=over)
     return np.stack([np.square(means - truth).sum(axis=over), variances / n_episodes, norms, products])
 
 
-def measured(policy: TabularPolicy, values: np.ndarray, n_episodes: int, generator: np.random.Generator) -> np.ndarray:
-    """:return: the same, estimated from one rollout"""
+def measured(
+    policy: TabularPolicy,
+    values: np.ndarray,
+    n_episodes: int,
+    generator: np.random.Generator,
+    n_projections: int | None = None,
+) -> np.ndarray:
+    """:return: the same, estimated from one rollout, or from random projections of its gradients"""
     episodes = sample_episodes(policy, n_episodes, generator)
     gradients = [
         episode_gradients(policy, episodes, episode_advantages(policy, episodes, values, GAMMA, gae_lambda))
@@ -42,6 +50,8 @@ def measured(policy: TabularPolicy, values: np.ndarray, n_episodes: int, generat
     ]
     size = n_episodes // N_GROUPS
     sums = np.stack(gradients, axis=1).reshape(N_GROUPS, size, len(PAPER_LAMBDAS), -1).sum(axis=1)
+    if n_projections is not None:
+        sums = sums @ generator.normal(size=(sums.shape[-1], n_projections)) / np.sqrt(n_projections)
     return np.stack([each.value for each in gradient_errors(sums, np.full(N_GROUPS, size))])
 
 

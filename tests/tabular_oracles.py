@@ -44,11 +44,17 @@ class Trajectory(NamedTuple):
     def rewards(self, mdp: TabularMDP) -> list[float]:
         return [mdp.rewards[s, a, t] for s, a, t in zip(self.states, self.actions, self.states[1:], strict=False)]
 
-    def advantages(self, mdp: TabularMDP, values: np.ndarray, gamma: float, gae_lambda: float) -> list[float]:
-        """The paper's equation 16, term by term."""
+    def advantages(self, mdp: TabularMDP, values: np.ndarray, gamma: float, gae_lambda: float | np.ndarray) -> list[float]:
+        """The paper's equation 16, term by term; for a λ of shape (S,), with the product of those on the way."""
         known = [0.0 if mdp.terminal[s] else values[s] for s in self.states]
         deltas = [r + gamma * known[t + 1] - known[t] for t, r in enumerate(self.rewards(mdp))]
-        return [sum((gamma * gae_lambda) ** (k - t) * deltas[k] for k in range(t, len(deltas))) for t in range(len(deltas))]
+        factors = gamma * np.broadcast_to(gae_lambda, mdp.n_states)
+
+        def weight(first: int, last: int) -> float:
+            return float(np.prod(factors[list(self.states[first + 1 : last + 1])]))
+
+        steps = range(len(deltas))
+        return [sum(weight(t, k) * deltas[k] for k in steps if k >= t) for t in steps]
 
     def gradient(self, policy: TabularPolicy, signal: list[float]) -> np.ndarray:
         result = np.zeros_like(policy.logits)

@@ -16,9 +16,12 @@ from sb3_gae.zoo import default_hyperparams_path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 
+import lambda_variants as variants
 import training_diagnostics as diagnostics
 import training_figures as figures
 import value_errors as values
+from gridworld_figures import GAMMA, half_trained_policy
+from measured_lambda import exact
 
 ENV = "GaeCartPole-v0"
 TASK = diagnostics.TASKS[ENV]._replace(
@@ -116,3 +119,11 @@ def test_rank_correlation_is_spearmans() -> None:
     # With ties: ranks 1.5, 1.5, 3 and 1, 2, 3
     assert values.rank_correlation([0.0, 0.0, 1.0], [0.0, 1.0, 2.0]) == pytest.approx(np.sqrt(3) / 2)
     assert np.isnan(values.rank_correlation([1.0, 1.0], [1.0, 2.0]))
+
+
+def test_a_lambda_for_each_state_is_searched_from_the_best_common_one() -> None:
+    policy = half_trained_policy()
+    nothing = np.zeros(policy.mdp.n_states)
+    common = float(variants.MERIT(exact(policy, nothing, 20)).max())
+    bound = float(np.linalg.norm(policy.true_gradient(GAMMA)))
+    assert common < variants.best_for_each_state(policy, nothing, 20) < bound

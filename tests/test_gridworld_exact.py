@@ -30,7 +30,7 @@ def random_values(policy: TabularPolicy, seed: int) -> np.ndarray:
 
 
 def moments_by_enumeration(
-    policy: TabularPolicy, trajectories: list[Trajectory], values: np.ndarray, gamma: float, gae_lambda: float
+    policy: TabularPolicy, trajectories: list[Trajectory], values: np.ndarray, gamma: float, gae_lambda: float | np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Mean of the gradient, and trace of its covariance."""
     chances = np.array([each.probability for each in trajectories])
@@ -57,6 +57,17 @@ def test_moments_of_the_gradient_are_those_over_all_trajectories(seed: int, gamm
     assert curve.variance[0] == moments.variance
     truth = policy.true_gradient(gamma)
     assert curve.bias_squared[0] == pytest.approx(np.square(mean - truth).sum(), abs=1e-12)
+
+
+@given(seeds, factors)
+def test_moments_of_the_gradient_with_a_lambda_for_each_state(seed: int, gamma: float) -> None:
+    policy = random_policy(layered_mdp(seed), seed)
+    values, trajectories = random_values(policy, seed), all_trajectories(policy)
+    lambdas = np.random.default_rng(seed).uniform(size=policy.mdp.n_states)
+    mean, variance = moments_by_enumeration(policy, trajectories, values, gamma, lambdas)
+    moments = policy.gradient_moments(values, gamma, lambdas)
+    np.testing.assert_allclose(moments.mean, mean, atol=1e-12)
+    assert moments.variance == pytest.approx(variance, abs=1e-11)
 
 
 @given(seeds, factors, factors)
@@ -283,5 +294,7 @@ def test_refuses_bad_arguments() -> None:
         policy.true_gradient(1.5)
     with pytest.raises(ValueError, match=r"`gae_lambda` must be a number in \[0, 1\], got -0.1"):
         policy.gradient_moments(np.zeros(25), 0.9, -0.1)
+    with pytest.raises(ValueError, match=r"`gae_lambda` must be a number or have the shape \(25,\), got \(3,\)"):
+        policy.gradient_moments(np.zeros(25), 0.9, np.ones(3))
     with pytest.raises(ValueError, match="`n_lags` must be a whole number of at least 1, got 0"):
         response_function(policy, 0)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_gae.checks import check_number
+from sb3_gae.checks import check_number, check_unit_interval
 from sb3_gae.gridworld.model import TabularMDP
 
 
@@ -86,12 +86,13 @@ class TabularPolicy:
         """Expected number of steps of an episode."""
         return float(self.visits[~self.mdp.terminal].sum())
 
-    def discounted_sums(self, terms: np.ndarray, discount: float) -> np.ndarray:
+    def discounted_sums(self, terms: np.ndarray, discount: float | np.ndarray) -> np.ndarray:
         r"""
-        :math:`E[\sum_l \mathrm{discount}^l x(s_{t+l}) | s_t = s]`.
+        :math:`E[\sum_l \mathrm{discount}^l x(s_{t+l}) | s_t = s]`; for a discount that depends on the state, with the product
+        of those of :math:`s_{t+1} ... s_{t+l}`.
 
         :param terms: :math:`x`, shape (S, ...)
-        :param discount: in [0, 1]
+        :param discount: in [0, 1], one for all states or shape (S,)
         :return: shape (S, ...)
         """
         flat = terms.reshape(self.mdp.n_states, -1)
@@ -179,40 +180,41 @@ class TabularPolicy:
         """
         return self.gradient_of(self.advantages(gamma))
 
-    def expected_advantages(self, values: np.ndarray, gamma: float, gae_lambda: float) -> np.ndarray:
+    def expected_advantages(self, values: np.ndarray, gamma: float, gae_lambda: float | np.ndarray) -> np.ndarray:
         r"""
         :math:`E[\hat A_t^{GAE(\gamma,\lambda)} | s_t, a_t]` for any :math:`V`: the expected residual, and from the
         next state on the expected sum of residuals with discount :math:`\gamma\lambda`.
 
         :param values: any :math:`V`, shape (S,)
         :param gamma: discount factor in [0, 1]
-        :param gae_lambda: weight of longer estimates in [0, 1]
+        :param gae_lambda: weight of longer estimates in [0, 1]; of shape (S,) for one that depends on the state,
+            :math:`\hat A_t = \delta_t + \gamma\lambda(s_{t+1})\hat A_{t+1}`
         :return: shape (S, A)
         :raises ValueError: if the shape does not fit, or a factor is out of range
         """
-        check_number("gae_lambda", gae_lambda, 0.0, 1.0)
+        decay = gamma * self._checked_lambda(gae_lambda)
         residuals = self.over_next_states(self.deltas(values, gamma))
-        following = self.discounted_sums(self.over_actions(residuals), gamma * gae_lambda)
-        return residuals + gamma * gae_lambda * self.over_next_states(following)
+        following = self.discounted_sums(self.over_actions(residuals), decay)
+        return residuals + self.over_next_states(decay * following)
 
-    def expected_gradient(self, values: np.ndarray, gamma: float, gae_lambda: float) -> np.ndarray:
+    def expected_gradient(self, values: np.ndarray, gamma: float, gae_lambda: float | np.ndarray) -> np.ndarray:
         r"""
         :math:`E[\sum_t \hat A_t \nabla_\theta\log\pi(a_t|s_t)]`; the true gradient if :math:`\lambda = 1`
         or :math:`V = V^{\pi,\gamma}`.
 
         :param values: any :math:`V`, shape (S,)
         :param gamma: discount factor in [0, 1]
-        :param gae_lambda: weight of longer estimates in [0, 1]
+        :param gae_lambda: as in :meth:`expected_advantages`
         :return: shape (S, A)
         :raises ValueError: if the shape does not fit, or a factor is out of range
         """
         return self.gradient_of(self.expected_advantages(values, gamma, gae_lambda))
 
-    def gradient_moments(self, values: np.ndarray, gamma: float, gae_lambda: float) -> GradientMoments:
+    def gradient_moments(self, values: np.ndarray, gamma: float, gae_lambda: float | np.ndarray) -> GradientMoments:
         r"""
         Mean and variance of one episode's gradient, both exact.
 
-        With :math:`c = \gamma\lambda`, what is summed from step t on obeys
+        With :math:`c = \gamma\lambda(s_{t+1})`, what is summed from step t on obeys
         :math:`\hat A_t = \delta_t + c\hat A_{t+1}` and :math:`G_t = \hat A_t\psi_t + G_{t+1}`,
         :math:`\psi_t = \nabla_\theta\log\pi(a_t|s_t)`. Squaring these and taking expectations given :math:`s_t` leaves
         one linear system each for :math:`E[\hat A]`, :math:`E[\hat A^2]`, :math:`E[G]`, :math:`E[\hat A G]` and
@@ -220,15 +222,15 @@ class TabularPolicy:
 
         :param values: any :math:`V`, shape (S,)
         :param gamma: discount factor in [0, 1]
-        :param gae_lambda: weight of longer estimates in [0, 1]
+        :param gae_lambda: as in :meth:`expected_advantages`
         :return: see :class:`GradientMoments`
         :raises ValueError: if the shape does not fit, or a factor is out of range
         """
         advantages = self.expected_advantages(values, gamma, gae_lambda)
-        deltas, decay = self.deltas(values, gamma), gamma * gae_lambda
+        deltas, decay = self.deltas(values, gamma), gamma * self._checked_lambda(gae_lambda)
         known = np.square(deltas) + 2.0 * decay * deltas * self.over_actions(advantages)
-        squares = self.discounted_sums(self.over_actions(self.over_next_states(known)), decay**2)
-        squared_advantages = self.over_next_states(known + decay**2 * squares)
+        squares = self.discounted_sums(self.over_actions(self.over_next_states(known)), np.square(decay))
+        squared_advantages = self.over_next_states(known + np.square(decay) * squares)
 
         gradients = self.discounted_sums(self._at_own_state(self._scored(advantages)), 1.0)
         products = self.discounted_sums(
@@ -262,6 +264,17 @@ class TabularPolicy:
             bias_squared=np.array([np.square(each.mean - truth).sum() for each in moments]),
             variance=np.array([each.variance for each in moments]),
         )
+
+    def _checked_lambda(self, gae_lambda: float | np.ndarray) -> np.ndarray:
+        r""":math:`\lambda` of the state that follows a step, shape (S,)."""
+        if np.ndim(gae_lambda) == 0:
+            check_number("gae_lambda", gae_lambda, 0.0, 1.0)
+            return np.full(self.mdp.n_states, gae_lambda, dtype=np.float64)
+        check_unit_interval("gae_lambda", gae_lambda)
+        lambdas, shape = np.asarray(gae_lambda, dtype=np.float64), (self.mdp.n_states,)
+        if lambdas.shape != shape:
+            raise ValueError(f"`gae_lambda` must be a number or have the shape {shape}, got {lambdas.shape}.")
+        return lambdas
 
     def _scored(self, signal: np.ndarray) -> np.ndarray:
         r""":math:`\sum_a \pi(a|s)\,x(s,a)\,\partial\log\pi(a|s)/\partial\theta(s,b)` for each s and b, shape (S, A)."""
