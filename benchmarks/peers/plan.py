@@ -38,8 +38,12 @@ class Cell(NamedTuple):
     @property
     def name(self) -> str:
         """What tells it from all others, fit for a file's name."""
-        algorithm = f"{self.algorithm}.{self.variant}" if self.variant else self.algorithm
-        return f"{self.task}_{algorithm}_{self.steps}_seed{self.seed}"
+        return f"{self.task}_{self.kind}_{self.steps}_seed{self.seed}"
+
+    @property
+    def kind(self) -> str:
+        """Algorithm and variant."""
+        return f"{self.algorithm}.{self.variant}" if self.variant else self.algorithm
 
 
 def cells_of(presets: Iterable[str]) -> list[Cell]:

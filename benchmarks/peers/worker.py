@@ -16,12 +16,15 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.peers.algorithms import ALGORITHMS
-from benchmarks.peers.journal import BusyError, Journal, Line, State, journal_path, read_record
+from benchmarks.peers.checkpoint import Checkpoint
+from benchmarks.peers.journal import BusyError, Journal, Line, Record, State, journal_path, read_record
 from benchmarks.peers.plan import Cell
 from benchmarks.peers.settings import hash_of, settings_of
 
 #: exit status where another process has the run
 BUSY = 3
+# Between the commits of a run that was gone on with after another one
+_THEN = ", then "
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -83,31 +86,40 @@ def _run(cell: Cell, logs: Path, journal: Journal) -> None:
         else:
             from benchmarks.peers.zoo_run import checkpoint_in, run_in_zoo
 
-            known = kept_evaluations(journal_path(logs, cell), start, checkpoint_in(folder, cell))
+            checkpoint = checkpoint_in(folder, cell)
+            start, known = continued(read_record(journal_path(logs, cell)), start, checkpoint)
             if known is None:
+                checkpoint = None
                 shutil.rmtree(folder, ignore_errors=True)
-            found = checkpoint_in(folder, cell)
             journal.begin(start, known or ())
-            steps = run_in_zoo(cell, settings, folder, clock, recorder, None if found is None else found[0])
+            steps = run_in_zoo(cell, settings, folder, clock, recorder, checkpoint)
     if steps < cell.steps:
         raise RuntimeError(f"the training ended after {steps} of {cell.steps} steps")
     journal.end(State.DONE)
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def kept_evaluations(path: Path, start: Line, checkpoint: tuple[Path, int] | None) -> list[Line] | None:
+def continued(before: Record, start: Line, checkpoint: Checkpoint | None) -> tuple[Line, list[Line] | None]:
     """
-    :param path: of the run's file
-    :param start: its line as of now
-    :param checkpoint: from where the run could go on, and after how many steps
-    :return: evaluations until then; None if it has to begin anew, as when the code or the settings are no longer the same
+    :param before: what the run's file says
+    :param start: the line of the beginning as of now
+    :param checkpoint: from where the run could go on
+    :return: the line of the beginning, which names all commits, and the evaluations until the checkpoint; None for these if
+        the run has to begin anew, as when settings, packages or the machine are no longer the same
     """
-    before = read_record(path)
-    if checkpoint is None or before.start is None:
-        return None
-    if any(before.start[name] != start[name] for name in ("cell", "settings_hash", "origin")):
-        return None
-    return [line for line in before.evaluations if line["steps"] <= checkpoint[1]]
+    if checkpoint is None or before.start is None or _sameness(before.start) != _sameness(start):
+        return start, None
+    commits = before.start["origin"]["commit"].split(_THEN)
+    if start["origin"]["commit"] not in commits:
+        commits.append(start["origin"]["commit"])
+    origin = start["origin"] | {"commit": _THEN.join(commits)}
+    return start | {"origin": origin}, [line for line in before.evaluations if line["steps"] <= checkpoint.steps]
+
+
+def _sameness(start: Line) -> Line:
+    # Not the commit: documents and tests change, too, while runs of days go on
+    origin = {name: value for name, value in start["origin"].items() if name != "commit"}
+    return {"cell": start["cell"], "settings_hash": start["settings_hash"], "origin": origin}
 
 
 def in_one_line(error: BaseException) -> str:

@@ -10,6 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import set_random_seed
 
 from benchmarks.peers.algorithms import OURS
+from benchmarks.peers.checkpoint import Checkpoint
 from benchmarks.peers.clock import TrainingClock
 from benchmarks.peers.plan import Cell
 from benchmarks.peers.protocol import evaluation_interval
@@ -21,11 +22,11 @@ from sb3_gae.checkpoint_file import newest_checkpoint, timesteps_of
 _CHECKPOINTS = "checkpoints"
 
 
-def checkpoint_in(folder: Path, cell: Cell) -> tuple[Path, int] | None:
+def checkpoint_in(folder: Path, cell: Cell) -> Checkpoint | None:
     """
     :param folder: of the run
     :param cell: that is run
-    :return: from where it can go on, and after how many steps; None if it has to begin anew
+    :return: from where it can go on; None if it has to begin anew
     """
     if cell.algorithm != OURS:
         return None
@@ -33,11 +34,11 @@ def checkpoint_in(folder: Path, cell: Cell) -> tuple[Path, int] | None:
         path, _ = newest_checkpoint(folder / _CHECKPOINTS)
     except (FileNotFoundError, ValueError):
         return None
-    return path, timesteps_of(path)
+    return Checkpoint(path, timesteps_of(path))
 
 
 def run_in_zoo(
-    cell: Cell, settings: dict[str, Any], folder: Path, clock: TrainingClock, recorder: Recorder, checkpoint: Path | None
+    cell: Cell, settings: dict[str, Any], folder: Path, clock: TrainingClock, recorder: Recorder, checkpoint: Checkpoint | None
 ) -> int:
     """
     Train.
@@ -63,10 +64,11 @@ def run_in_zoo(
         n_timesteps=cell.steps,
         eval_freq=-1,
         seed=cell.seed,
+        log_interval=-1,
         verbose=0,
         device="cpu",
         config=str(file),
-        trained_agent="" if checkpoint is None else str(checkpoint),
+        trained_agent="" if checkpoint is None else str(checkpoint.path),
     )
     made = manager.setup_experiment()
     assert made is not None
