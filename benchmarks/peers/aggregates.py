@@ -1,0 +1,74 @@
+"""Over tasks, as rliable recommends and computes it."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from rliable import library, metrics
+
+from sb3_gae.sweep.statistics import CONFIDENCE, RESAMPLES, fixed_random_numbers, interquartile_mean
+
+#: scores of several algorithms: for each, an array of shape (runs, tasks)
+Scores = dict[str, np.ndarray]
+
+
+class Interval(NamedTuple):
+    """
+    :param point: an estimate
+    :param low: lower end of its interval of 95 %
+    :param high: upper end
+    """
+
+    point: float
+    low: float
+    high: float
+
+
+def normalized(scores: list[np.ndarray], reference: list[np.ndarray]) -> np.ndarray:
+    """
+    :param scores: of one algorithm, for each task those of its runs
+    :param reference: of the algorithm that counts as 1, likewise
+    :return: scores in units of the reference's interquartile mean, shape (runs, tasks), with as many runs as all tasks have
+    :raises ValueError: if a reference is not positive, so that to be a multiple of it means nothing
+    """
+    units = [float(interquartile_mean(runs)) for runs in reference]
+    if any(unit <= 0 for unit in units):
+        raise ValueError("`reference` must be positive for each task, or nothing can be a multiple of it.")
+    n_runs = min(len(runs) for runs in scores)
+    return np.stack([runs[:n_runs] / unit for runs, unit in zip(scores, units, strict=True)], axis=1)
+
+
+def interquartile_means(scores: Scores) -> dict[str, Interval]:
+    """
+    :param scores: normalised, of each algorithm
+    :return: over its runs and tasks
+    """
+    return {name: _interval((own,), metrics.aggregate_iqm) for name, own in scores.items()}
+
+
+def improvement(first: np.ndarray, second: np.ndarray) -> Interval:
+    """
+    :param first: scores of one algorithm, shape (runs, tasks)
+    :param second: of another
+    :return: probability that a run of the first is better than one of the second, mean over tasks
+    """
+    return _interval((first, second), metrics.probability_of_improvement)
+
+
+def ratio(first: np.ndarray, second: np.ndarray) -> Interval:
+    """
+    :param first: scores of one algorithm, shape (runs, tasks)
+    :param second: of another
+    :return: how many times as large the interquartile mean of the first is
+    """
+    return _interval((first, second), lambda x, y: metrics.aggregate_iqm(x) / metrics.aggregate_iqm(y))
+
+
+def _interval(scores: tuple[np.ndarray, ...], function: Callable[..., float]) -> Interval:
+    data = {"": scores[0] if len(scores) == 1 else scores}
+    with fixed_random_numbers():
+        points, intervals = library.get_interval_estimates(
+            data, lambda *drawn: np.array([function(*drawn)]), reps=RESAMPLES, confidence_interval_size=CONFIDENCE
+        )
+    low, high = intervals[""][:, 0]
+    return Interval(float(points[""][0]), float(low), float(high))
