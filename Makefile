@@ -5,7 +5,7 @@
 #   make check                     formatting, lint, types
 #   make format                    put formatting right
 #   make bench                     speed of an update beside sb3-contrib's
-#   make bench-full                also speed of whole iterations, and what the shipped settings reach (hours)
+#   make bench-full                also speed of whole iterations, what the shipped settings reach, and peers (days)
 #   make clean                     remove .venv and what builds and tools left
 #   make PYTHON=python3.12 train   choose an interpreter
 
@@ -66,6 +66,10 @@ bench-full: bench
 	$(IN_VENV) python benchmarks/rollout_speed.py
 	$(IN_VENV) python benchmarks/first_results.py
 	$(IN_VENV) python benchmarks/paper_tasks.py
+	$(BIN)/python -m pip install -c constraints.txt -e ".[tests,benchmarks]"
+	$(IN_VENV) python -m benchmarks.peers run --jobs 2
+	$(IN_VENV) python -m benchmarks.peers export
+	$(IN_VENV) python -m benchmarks.peers report
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks docs/_build

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from rliable import library, metrics
 
-from sb3_gae.sweep.statistics import CONFIDENCE, RESAMPLES, fixed_random_numbers, interquartile_mean
+from sb3_gae.sweep.statistics import CONFIDENCE, RESAMPLES, Estimate, fixed_random_numbers, interquartile_mean
 
 #: scores of several algorithms: for each, an array of shape (runs, tasks)
 Scores = dict[str, np.ndarray]
@@ -46,13 +46,32 @@ def interquartile_means(scores: Scores) -> dict[str, Interval]:
     return {name: _interval((own,), metrics.aggregate_iqm) for name, own in scores.items()}
 
 
+def curve_over_tasks(scores: np.ndarray) -> Estimate:
+    """
+    :param scores: normalised, of one algorithm at P points of its trainings, shape (runs, tasks, P)
+    :return: interquartile means over runs and tasks at each point
+    """
+    return _bootstrap((scores,), lambda drawn: interquartile_mean(drawn.reshape(-1, drawn.shape[-1])))
+
+
 def improvement(first: np.ndarray, second: np.ndarray) -> Interval:
     """
     :param first: scores of one algorithm, shape (runs, tasks)
     :param second: of another
     :return: probability that a run of the first is better than one of the second, mean over tasks
     """
-    return _interval((first, second), metrics.probability_of_improvement)
+    return _interval((first, second), probability_of_improvement)
+
+
+def probability_of_improvement(first: np.ndarray, second: np.ndarray) -> float:
+    """
+    What ``rliable.metrics.probability_of_improvement`` gives, in a hundredth of its time, which a bootstrap needs.
+
+    :param first: scores of one algorithm, shape (runs, tasks)
+    :param second: of another
+    :return: part of the pairs of runs of a task in which the first is better, equal ones counted half
+    """
+    return float((0.5 + 0.5 * np.sign(first[:, None] - second[None])).mean())
 
 
 def ratio(first: np.ndarray, second: np.ndarray) -> Interval:
@@ -65,10 +84,15 @@ def ratio(first: np.ndarray, second: np.ndarray) -> Interval:
 
 
 def _interval(scores: tuple[np.ndarray, ...], function: Callable[..., float]) -> Interval:
-    data = {"": scores[0] if len(scores) == 1 else scores}
+    result = _bootstrap(scores, lambda *drawn: np.array([function(*drawn)]))
+    return Interval(*(float(part[0]) for part in result))
+
+
+def _bootstrap(scores: tuple[np.ndarray, ...], function: Callable[..., np.ndarray]) -> Estimate:
+    data = scores[0] if len(scores) == 1 else scores
     with fixed_random_numbers():
         points, intervals = library.get_interval_estimates(
-            data, lambda *drawn: np.array([function(*drawn)]), reps=RESAMPLES, confidence_interval_size=CONFIDENCE
+            {"": data}, function, reps=RESAMPLES, confidence_interval_size=CONFIDENCE
         )
-    low, high = intervals[""][:, 0]
-    return Interval(float(points[""][0]), float(low), float(high))
+    low, high = intervals[""]
+    return Estimate(points[""], low, high)

@@ -28,3 +28,6 @@ ALGORITHMS = {
     TIANSHOU_TRPO: Algorithm("TRPO, tianshou", "tianshou", "#56b4e9", "--"),
     TIANSHOU_NPG: Algorithm("NPG, tianshou", "tianshou", "#7f7f7f", ":"),
 }
+
+#: what is imported of each library
+MODULES = {"zoo": "rl_zoo3", "tianshou": "tianshou"}

@@ -10,7 +10,7 @@ from benchmarks.peers.cost import SPEEDS, read_speeds
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.journal import State
 from benchmarks.peers.plan import PRESETS, Cell, cells_of
-from benchmarks.peers.pool import Options, Pool
+from benchmarks.peers.pool import Options, Pool, check_libraries
 from benchmarks.peers.progress import Bar, left_of, standings, summary
 from benchmarks.peers.protocol import CLASSIC_TASKS, MUJOCO_TASKS
 
@@ -87,6 +87,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.dry_run or not left:
         return 0
     options = Options(args.logs, args.jobs, not args.no_pin, {"tianshou": args.tianshou_python})
+    check_libraries(left, options)
     bar = Bar(left, args.logs)
     try:
         problems = Pool(left, options, bar.show).run()

@@ -1,5 +1,6 @@
 """What the tables and figures say, as numbers."""
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -29,8 +30,13 @@ def score(runs: list[Run]) -> Interval:
     :param runs: of one algorithm on one task
     :return: interquartile mean of the scores
     """
-    result = estimate(scores_of(runs)[:, None])
-    return Interval(float(result.iqm[0]), float(result.low[0]), float(result.high[0]))
+    return _score(tuple(scores_of(runs)))
+
+
+@functools.cache
+def _score(scores: tuple[float, ...]) -> Interval:
+    # Several tables and targets ask for the same one
+    return Interval(*(float(part[0]) for part in estimate(np.array(scores)[:, None])))
 
 
 def returns_after(runs: list[Run], seconds: float) -> np.ndarray:
@@ -64,9 +70,7 @@ def final_scores(runs: Runs) -> Scores:
     :return: scores of each algorithm that has all tasks, in units of sb3-contrib TRPO's
     """
     reference = [scores_of(own[TRPO]) for own in runs.values()]
-    return {
-        name: normalized([scores_of(own[name]) for own in runs.values()], reference) for name in common_algorithms(runs)
-    }
+    return {name: normalized([scores_of(own[name]) for own in runs.values()], reference) for name in common_algorithms(runs)}
 
 
 def scores_after(runs: Runs, fraction: float) -> Scores:

@@ -8,17 +8,14 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from benchmarks.peers.algorithms import ALGORITHMS
+from benchmarks.peers.aggregates import curve_over_tasks, normalized
+from benchmarks.peers.algorithms import ALGORITHMS, TRPO
 from benchmarks.peers.comparison import Runs, common_algorithms, mujoco_runs, scores_after, training_seconds
 from benchmarks.peers.curves import Run, against_seconds, against_steps, scores_of
-from benchmarks.peers.aggregates import interquartile_means, normalized
-from benchmarks.peers.algorithms import TRPO
 from benchmarks.peers.protocol import EVALUATIONS, MUJOCO_STEPS
-from sb3_gae.sweep.statistics import estimate
+from sb3_gae.sweep.statistics import Estimate, estimate
 
 _COLUMNS = 3
-#: points of the curves over tasks: each is a bootstrap of its own
-_POINTS = 21
 
 
 def draw_all(table: pd.DataFrame) -> dict[str, Figure]:
@@ -36,17 +33,14 @@ def draw_all(table: pd.DataFrame) -> dict[str, Figure]:
     }
 
 
-def _tasks_figure(
-    runs: Runs, curve: Callable[[list[Run]], tuple[np.ndarray, np.ndarray]], unit: float, label: str
-) -> Figure:
+def _tasks_figure(runs: Runs, curve: Callable[[list[Run]], tuple[np.ndarray, np.ndarray]], unit: float, label: str) -> Figure:
     n_rows = -(-len(runs) // _COLUMNS)
     figure = Figure(figsize=(3.4 * min(len(runs), _COLUMNS), 2.7 * n_rows + 0.5), layout="constrained")
     for place, (task, own) in enumerate(runs.items(), start=1):
         axes = figure.add_subplot(n_rows, min(len(runs), _COLUMNS), place)
         for name, algorithm_runs in own.items():
             grid, returns = curve(algorithm_runs)
-            result = estimate(returns)
-            _band(axes, name, grid / unit, result.iqm, result.low, result.high)
+            _band(axes, name, grid / unit, estimate(returns))
         axes.set_title(task)
         axes.set_xlabel(label)
         if place % _COLUMNS == 1 or len(runs) == 1:
@@ -58,14 +52,14 @@ def _tasks_figure(
 def _over_tasks_figure(runs: Runs) -> Figure:
     figure = Figure(figsize=(9.2, 3.9), layout="constrained")
     by_steps, by_seconds = figure.subplots(1, 2, sharey=True)
+    fractions = np.linspace(0, 1, EVALUATIONS + 1)
     reference = [scores_of(own[TRPO]) for own in runs.values()]
     for name in common_algorithms(runs):
-        own = [against_steps(task_runs[name], MUJOCO_STEPS)[1] for task_runs in runs.values()]
-        places = np.linspace(0, EVALUATIONS, _POINTS).round().astype(int)
-        scores = {str(place): normalized([returns[:, place] for returns in own], reference) for place in places}
-        _band(by_steps, name, places / EVALUATIONS, *_columns(scores))
-        fractions = np.linspace(0, 1, _POINTS)
-        _band(by_seconds, name, fractions, *_columns({f"{f}": scores_after(runs, f)[name] for f in fractions}))
+        curves = [against_steps(own[name], MUJOCO_STEPS)[1] for own in runs.values()]
+        by_evaluation = [normalized([curve[:, place] for curve in curves], reference) for place in range(len(fractions))]
+        _band(by_steps, name, fractions, curve_over_tasks(np.stack(by_evaluation, axis=-1)))
+        at_times = [scores_after(runs, fraction)[name] for fraction in fractions]
+        _band(by_seconds, name, fractions, curve_over_tasks(np.stack(at_times, axis=-1)))
     by_steps.set_xlabel("million steps")
     seconds = [training_seconds(own[TRPO]) for own in runs.values()]
     by_seconds.set_xlabel(f"part of the time that sb3-contrib's TRPO takes ({min(seconds):.0f} to {max(seconds):.0f} s)")
@@ -74,14 +68,10 @@ def _over_tasks_figure(runs: Runs) -> Figure:
     return figure
 
 
-def _columns(scores: dict[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-    return tuple(np.array(column) for column in zip(*interquartile_means(scores).values(), strict=True))
-
-
-def _band(axes: Axes, name: str, x: np.ndarray, middle: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
+def _band(axes: Axes, name: str, x: np.ndarray, curve: Estimate) -> None:
     style: dict[str, Any] = {"color": ALGORITHMS[name].colour, "linestyle": ALGORITHMS[name].dash}
-    axes.plot(x, middle, label=ALGORITHMS[name].title, linewidth=1.7, zorder=3, **style)
-    axes.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
+    axes.plot(x, curve.iqm, label=ALGORITHMS[name].title, linewidth=1.7, zorder=3, **style)
+    axes.fill_between(x, curve.low, curve.high, color=style["color"], alpha=0.15, linewidth=0)
     axes.grid(alpha=0.25)
     axes.set_xlim(left=0)
 

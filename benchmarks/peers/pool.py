@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.peers.algorithms import ALGORITHMS
+from benchmarks.peers.algorithms import ALGORITHMS, MODULES
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.journal import BusyError, Journal, State, journal_path, read_record
 from benchmarks.peers.plan import Cell
@@ -49,6 +49,25 @@ def cores_for(options: Options) -> list[int | None]:
     if options.jobs > len(cores):
         raise PeersError(f"`jobs` must be at most {len(cores)}, the number of cores, got {options.jobs}; or add --no-pin.")
     return list(cores[: options.jobs])
+
+
+def check_libraries(cells: Sequence[Cell], options: Options) -> None:
+    """
+    Say so at once where a peer is missing, rather than have all of its runs fail.
+
+    :param cells: to run
+    :param options: of the command
+    :raises PeersError: if an interpreter lacks what it is to run
+    """
+    look = "import importlib.util, sys; sys.exit(importlib.util.find_spec(sys.argv[1]) is None)"
+    for library in dict.fromkeys(ALGORITHMS[cell.algorithm].library for cell in cells):
+        module, python = MODULES[library], options.pythons.get(library, sys.executable)
+        if subprocess.run([python, "-c", look, module]).returncode != 0:
+            others = " ".join(dict.fromkeys(cell.algorithm for cell in cells if ALGORITHMS[cell.algorithm].library != library))
+            raise PeersError(
+                f"{module} is not installed for {python}: pip install -c constraints.txt -e '.[benchmarks]'"
+                + (f", or leave it out: --algorithms {others}" if others else "")
+            )
 
 
 class Pool:

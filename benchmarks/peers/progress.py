@@ -67,7 +67,9 @@ def summary(table: Sequence[Standing], left: Sequence[Cell], speeds: Speeds, job
         runs = [(one.cell, one.record) for one in table if one.state == State.DONE]
         hours = {cell: cost_of(cell, speeds, runs) / 3600 for cell in left}
         total = sum(hours.values())
-        lines.append(f"{len(left)} runs left, about {total:.1f} core-hours, {total / jobs:.1f} hours with {jobs} side by side:")
+        lines.append(
+            f"{len(left)} runs left, about {total:.1f} core-hours, {total / jobs:.1f} hours with {jobs} side by side:"
+        )
         for task in dict.fromkeys(cell.task for cell in left):
             own = [cell for cell in left if cell.task == task]
             lines.append(f"  {task}: {sum(hours[cell] for cell in own):.1f} core-hours ({_by_kind(own, hours)})")

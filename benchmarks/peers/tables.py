@@ -19,7 +19,7 @@ from benchmarks.peers.comparison import (
 from benchmarks.peers.curves import Run, all_runs, runs_of, scores_of
 from benchmarks.peers.plan import ABLATION_TASKS
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, PUBLISHED_PPO
-from benchmarks.peers.variants import SHIPPED, VARIANTS
+from benchmarks.peers.variants import VARIANTS
 from sb3_gae.sweep.statistics import interquartile_mean
 
 #: parts of sb3-contrib TRPO's training time at which scores are compared
@@ -69,9 +69,7 @@ def clock_table(table: pd.DataFrame) -> str:
     means = {title: interquartile_means(scores) for title, scores in found.items()}
     rows = []
     for name in common_algorithms(runs):
-        better = [
-            "" if name == OURS else _decimal(improvement(scores[OURS], scores[name])) for scores in found.values()
-        ]
+        better = ["" if name == OURS else _decimal(improvement(scores[OURS], scores[name])) for scores in found.values()]
         cells = [part for title, chance in zip(found, better, strict=True) for part in (_decimal(means[title][name]), chance)]
         rows.append([ALGORITHMS[name].title, *cells])
     heads = [head for title in FRACTIONS for head in (f"IQM after {title}", "ours is better")]
@@ -196,7 +194,9 @@ def origin_list(table: pd.DataFrame) -> str:
     names = {"processor": "processor", "cores": "cores", "cores_of_run": "cores of a run", "python": "Python"}
     names |= {name: name.replace("_", "-") for name in ("sb3_gae", "sb3_contrib", "stable_baselines3", "rl_zoo3", "tianshou")}
     names |= {name: name for name in ("gymnasium", "mujoco", "envpool", "torch")}
-    held = {title: sorted({str(value) for value in table[name] if value != ""}) for name, title in names.items() if name in table}
+    held = {
+        title: sorted({str(value) for value in table[name] if value != ""}) for name, title in names.items() if name in table
+    }
     return "\n".join(f"- {title}: {', '.join(values)}" for title, values in held.items() if values)
 
 

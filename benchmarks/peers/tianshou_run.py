@@ -60,9 +60,7 @@ def run_in_tianshou(cell: Cell, settings: dict[str, Any], folder: Path, clock: T
     )
     world = _world(cell, settings, config, folder)
     act = agent_of(world)
-    per_update = config.num_training_envs * math.ceil(
-        settings["collection_step_num_env_steps"] / config.num_training_envs
-    )
+    per_update = config.num_training_envs * math.ceil(settings["collection_step_num_env_steps"] / config.num_training_envs)
     due = 0
 
     def between_updates(epoch: int, steps: int) -> None:
