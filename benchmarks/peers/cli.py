@@ -17,6 +17,9 @@ from benchmarks.peers.protocol import CLASSIC_TASKS, MUJOCO_TASKS
 #: all that the results page has
 DEFAULT_PRESETS = ("classic", "mujoco", "mujoco-3m", "ablation")
 
+#: of the environment that `make bench-full` makes
+TIANSHOU_PYTHON = ".venv-tianshou/bin/python"
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """
@@ -52,7 +55,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--no-pin", action="store_true", help="do not keep runs to a core each")
     run.add_argument(
-        "--tianshou-python", default=sys.executable, help="interpreter that has tianshou, where it is not this one"
+        "--tianshou-python",
+        default=TIANSHOU_PYTHON if Path(TIANSHOU_PYTHON).exists() else sys.executable,
+        help="interpreter that has tianshou (%(default)s)",
     )
     run.set_defaults(command=_run)
     verbs.add_parser("status", parents=[plan], help="where the runs stand").set_defaults(command=_status)

@@ -65,8 +65,8 @@ def check_libraries(cells: Sequence[Cell], options: Options) -> None:
         if subprocess.run([python, "-c", look, module]).returncode != 0:
             others = " ".join(dict.fromkeys(cell.algorithm for cell in cells if ALGORITHMS[cell.algorithm].library != library))
             raise PeersError(
-                f"{module} is not installed for {python}: pip install -c constraints.txt -e '.[benchmarks]'"
-                + (f", or leave it out: --algorithms {others}" if others else "")
+                f"{module} is not installed for {python}; install it (see docs/benchmarks.md)"
+                + (f", or leave it out: --algorithms {others}" if others else ".")
             )
 
 
