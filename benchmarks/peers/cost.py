@@ -58,7 +58,7 @@ def seconds_of(record: Record) -> float:
 
 def _expected(cell: Cell, speeds: Speeds) -> float:
     # A peer that was not there when speeds were measured is taken to be as fast as the one that is most like it
-    speed = speeds.get((cell.task, cell.algorithm), speeds[cell.task, TRPO])
+    speed = speeds.get((cell.task, cell.algorithm)) or speeds[cell.task, TRPO]
     longest = gym.spec(cell.task).max_episode_steps or 1000
     # Episodes that last to their time limit, which is the most that an evaluation can take
     evaluation = EPISODES * longest / speeds[cell.task, EVALUATION]

@@ -30,11 +30,6 @@ class Run(NamedTuple):
         """Mean return of the last evaluations."""
         return float(self.returns[-SCORED_EVALUATIONS:].mean())
 
-    @property
-    def best(self) -> float:
-        """Largest mean return of an evaluation, as some tables in the literature have it."""
-        return float(self.returns.max())
-
 
 def runs_of(table: pd.DataFrame, task: str, algorithm: str, steps: int, variant: str = SHIPPED) -> list[Run]:
     """
