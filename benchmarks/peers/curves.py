@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.peers.algorithms import ALGORITHMS
-from benchmarks.peers.protocol import EVALUATIONS, SCORED_EVALUATIONS
+from benchmarks.peers.protocol import EVALUATIONS, SCORED_PART
 from benchmarks.peers.variants import SHIPPED
 
 
@@ -27,8 +27,8 @@ class Run(NamedTuple):
 
     @property
     def score(self) -> float:
-        """Mean return of the last evaluations."""
-        return float(self.returns[-SCORED_EVALUATIONS:].mean())
+        """Mean return of the evaluations of the last part; one at least, however large the batches are."""
+        return float(self.returns[self.steps > (1 - SCORED_PART) * self.steps[-1]].mean())
 
 
 def runs_of(table: pd.DataFrame, task: str, algorithm: str, steps: int, variant: str = SHIPPED) -> list[Run]:

@@ -23,8 +23,8 @@ EVALUATIONS = 40
 EPISODES = 10
 #: of the first environment for evaluation; the others count on from it. The same in every evaluation of every run
 FIRST_EVALUATION_SEED = 10_000
-#: evaluations that the score of a run is the mean of: those of the last tenth
-SCORED_EVALUATIONS = 4
+#: part of a training, its last one, whose evaluations a run's score is the mean of
+SCORED_PART = 0.1
 
 
 def evaluation_interval(steps: int) -> int:
