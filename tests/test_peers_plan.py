@@ -14,6 +14,7 @@ from benchmarks.peers.plan import PRESETS, Cell, cells_of
 from benchmarks.peers.protocol import CLASSIC_TASKS, EVALUATIONS, MUJOCO_TASKS, evaluation_interval
 from benchmarks.peers.settings import hash_of, settings_for, settings_of, zoo_file
 from benchmarks.peers.variants import VARIANTS
+from sb3_gae import TRPOGAE
 from sb3_gae.zoo import default_hyperparams_path
 
 ALL = cells_of(PRESETS)
@@ -85,6 +86,15 @@ def test_variants_undo_a_choice() -> None:
     for name, variant in VARIANTS.items():
         changed = settings_of(Cell("Hopper-v5", OURS, name, 0, 1_000_000))
         assert (changed != shipped) == bool(variant.overrides)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_variants_are_arguments_that_the_algorithm_takes(name: str) -> None:
+    # `normalize` is rl-zoo3's own
+    arguments = {key: value for key, value in VARIANTS[name].overrides.items() if key != "normalize"}
+    model = TRPOGAE("MlpPolicy", "Pendulum-v1", **arguments)
+    assert all(getattr(model, key) == value for key, value in arguments.items())
+    assert (model.gae_lambda == 0.95) == ("gae_lambda" not in arguments)
 
 
 def test_there_are_as_many_evaluations_as_said() -> None:

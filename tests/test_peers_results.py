@@ -103,7 +103,7 @@ def test_scores_are_in_units_of_the_peers() -> None:
 
 
 def test_a_unit_must_be_positive() -> None:
-    with pytest.raises(ValueError, match="`reference` must be positive"):
+    with pytest.raises(PeersError, match="`reference` must be positive"):
         normalized([np.array([1.0])], [np.array([-1.0])])
 
 

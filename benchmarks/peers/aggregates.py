@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from rliable import library, metrics
 
+from benchmarks.peers.errors import PeersError
 from sb3_gae.sweep.statistics import CONFIDENCE, RESAMPLES, Estimate, fixed_random_numbers, interquartile_mean
 
 #: scores of several algorithms: for each, an array of shape (runs, tasks)
@@ -29,11 +30,11 @@ def normalized(scores: list[np.ndarray], reference: list[np.ndarray]) -> np.ndar
     :param scores: of one algorithm, for each task those of its runs
     :param reference: of the algorithm that counts as 1, likewise
     :return: scores in units of the reference's interquartile mean, shape (runs, tasks), with as many runs as all tasks have
-    :raises ValueError: if a reference is not positive, so that to be a multiple of it means nothing
+    :raises PeersError: if a reference is not positive, so that to be a multiple of it means nothing
     """
     units = [float(interquartile_mean(runs)) for runs in reference]
     if any(unit <= 0 for unit in units):
-        raise ValueError("`reference` must be positive for each task, or nothing can be a multiple of it.")
+        raise PeersError("`reference` must be positive for each task, or nothing can be a multiple of it.")
     n_runs = min(len(runs) for runs in scores)
     return np.stack([runs[:n_runs] / unit for runs, unit in zip(scores, units, strict=True)], axis=1)
 
