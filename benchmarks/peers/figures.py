@@ -63,7 +63,7 @@ def _over_tasks_figure(runs: Runs) -> Figure:
     by_steps.set_xlabel("million steps")
     seconds = [training_seconds(own[TRPO]) for own in runs.values()]
     by_seconds.set_xlabel(f"part of the time that sb3-contrib's TRPO takes ({min(seconds):.0f} to {max(seconds):.0f} s)")
-    by_steps.set_ylabel("IQM over tasks, sb3-contrib's TRPO at its end = 1")
+    by_steps.set_ylabel("IQM over tasks, sb3-contrib's TRPO = 1")
     _legend(figure)
     return figure
 
