@@ -187,6 +187,7 @@ def test_a_run_of_ours_that_fails_goes_on_as_if_it_had_not(tmp_path: Path, monke
         patch.setattr(Recorder, "evaluate", fail)
         status, failed = run(tmp_path / "twice")
     assert status == 1
+    assert failed.steps == 2048
     assert failed.end is not None and failed.end["reason"].startswith("RuntimeError: a fault [test_peers_run.py:")
     status, second = run(tmp_path / "twice")
     assert status == 0

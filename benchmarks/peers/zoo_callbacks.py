@@ -17,11 +17,12 @@ class StopClock(BaseCallback):
 
     :param clock: of the training
     :param recorder: evaluates
+    :param steps: of the whole training
     """
 
-    def __init__(self, clock: TrainingClock, recorder: Recorder):
+    def __init__(self, clock: TrainingClock, recorder: Recorder, steps: int):
         super().__init__()
-        self._clock, self._recorder = clock, recorder
+        self._clock, self._recorder, self._steps = clock, recorder, steps
         self.wall_seconds, self.cpu_seconds = 0.0, 0.0
         self.next_evaluation, self.last_evaluation = 0, -1
 
@@ -35,8 +36,8 @@ class StopClock(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._stop()
-        # rl-zoo3 calls this a second time
-        if self.num_timesteps > self.last_evaluation:
+        # rl-zoo3 calls this a second time, and where a training is stopped
+        if self.num_timesteps >= self._steps and self.num_timesteps > self.last_evaluation:
             self._evaluate()
 
     def _stop(self) -> None:

@@ -73,7 +73,7 @@ def run_in_zoo(
     made = manager.setup_experiment()
     assert made is not None
     model, _ = made
-    stop = StopClock(clock, recorder)
+    stop = StopClock(clock, recorder, cell.steps)
     callbacks: list[BaseCallback] = [stop]
     if cell.algorithm == OURS:
         interval = max(1, evaluation_interval(cell.steps) // manager.n_envs)
