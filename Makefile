@@ -5,13 +5,14 @@
 #   make check                     formatting, lint, types
 #   make format                    put formatting right
 #   make bench                     speed of an update beside sb3-contrib's
-#   make bench-full                also speed of whole iterations, and what the shipped settings reach (hours)
+#   make bench-full                also speed of whole iterations, what the shipped settings reach, and peers (days)
 #   make clean                     remove .venv and what builds and tools left
 #   make PYTHON=python3.12 train   choose an interpreter
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+TIANSHOU := .venv-tianshou
 # Written last, so that a .venv without it is half-made
 STAMP := $(VENV)/.installed
 SETUP_FILES := setup.cfg setup.py pyproject.toml constraints.txt sb3_gae_zoo_hook.pth sb3_gae_zoo_hook.start
@@ -62,11 +63,21 @@ format: $(STAMP)
 bench: $(STAMP)
 	$(IN_VENV) python benchmarks/update_speed.py $(ARGS)
 
-bench-full: bench
+bench-full: bench $(TIANSHOU)/.installed
 	$(IN_VENV) python benchmarks/rollout_speed.py
 	$(IN_VENV) python benchmarks/first_results.py
 	$(IN_VENV) python benchmarks/paper_tasks.py
+	$(IN_VENV) python -m benchmarks.peers run --jobs 2
+	$(IN_VENV) python -m benchmarks.peers export
+	$(IN_VENV) python -m benchmarks.peers report
+
+# The peer that asks for packages that the others' set does not have
+$(TIANSHOU)/.installed: $(SETUP_FILES) benchmarks/peers/tianshou.txt
+	$(PYTHON) -m venv --clear $(TIANSHOU)
+	grep -v '^filelock==' constraints.txt > $(TIANSHOU)/constraints.txt
+	$(TIANSHOU)/bin/python -m pip install -c $(TIANSHOU)/constraints.txt -e . -r benchmarks/peers/tianshou.txt
+	@touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks docs/_build
+	rm -rf $(VENV) $(TIANSHOU) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis .benchmarks docs/_build
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

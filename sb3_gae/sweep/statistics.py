@@ -38,7 +38,7 @@ def estimate(values: np.ndarray, resamples: int = RESAMPLES) -> Estimate:
     :param resamples: of the bootstrap
     :return: for each of the P points by itself; the same numbers at each call
     """
-    with _fixed_random_numbers():
+    with fixed_random_numbers():
         points, intervals = library.get_interval_estimates(
             {"": values[:, None, :]},  # rliable's axes: runs, tasks, points
             lambda scores: interquartile_mean(scores[:, 0]),
@@ -71,7 +71,7 @@ def difference(better: np.ndarray, other: np.ndarray, resamples: int = RESAMPLES
     :param resamples: of the bootstrap, which draws both sets independently
     :return: by how much the interquartile mean of the first is larger, with arrays of shape (1,)
     """
-    with _fixed_random_numbers():
+    with fixed_random_numbers():
         points, intervals = library.get_interval_estimates(
             {"": (better[:, None], other[:, None])},  # runs, tasks
             lambda first, second: interquartile_mean(first) - interquartile_mean(second),
@@ -83,7 +83,7 @@ def difference(better: np.ndarray, other: np.ndarray, resamples: int = RESAMPLES
 
 
 @contextlib.contextmanager
-def _fixed_random_numbers() -> Iterator[None]:
+def fixed_random_numbers() -> Iterator[None]:
     """rliable draws from NumPy's global generator, whatever it is given."""
     before = np.random.get_state()
     np.random.seed(0)

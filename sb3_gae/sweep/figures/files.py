@@ -33,13 +33,17 @@ def write_figure(kind: str, table: pd.DataFrame, output: Path, iteration: int | 
         try:
             output.parent.mkdir(parents=True, exist_ok=True)
             for path in paths:
-                _save(figure, path)
+                save_figure(figure, path)
         except OSError as error:
             raise SweepError(f"`output`: {output} cannot be written ({error}); name another file.") from error
     return paths
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
+    """
+    :param figure: to be saved, the same figure as the same file
+    :param path: ending in one of :data:`SUFFIXES`
+    """
     # Without the date, and without the version of matplotlib
     metadata = {"Date": None} if path.suffix == ".svg" else {"Software": None}
     figure.savefig(path, dpi=160, bbox_inches="tight", metadata=metadata)

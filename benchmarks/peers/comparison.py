@@ -1,0 +1,129 @@
+"""What the tables and figures say, as numbers."""
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.peers.aggregates import Interval, Scores, normalized
+from benchmarks.peers.algorithms import OURS, TRPO
+from benchmarks.peers.curves import Run, all_runs, first_reach, scores_of
+from benchmarks.peers.protocol import MUJOCO_STEPS, MUJOCO_TASKS
+from sb3_gae.sweep.statistics import estimate, interquartile_mean
+
+#: runs of each algorithm, by task
+Runs = dict[str, dict[str, list[Run]]]
+
+
+def mujoco_runs(table: pd.DataFrame) -> Runs:
+    """
+    :param table: of results
+    :return: of the tasks that ours and sb3-contrib's TRPO have both been run on
+    """
+    found = {task: all_runs(table, task, MUJOCO_STEPS) for task in MUJOCO_TASKS}
+    return {task: runs for task, runs in found.items() if OURS in runs and TRPO in runs}
+
+
+def score(runs: list[Run]) -> Interval:
+    """
+    :param runs: of one algorithm on one task
+    :return: interquartile mean of the scores
+    """
+    return _score(tuple(scores_of(runs)))
+
+
+@functools.cache
+def _score(scores: tuple[float, ...]) -> Interval:
+    # Several tables and targets ask for the same one
+    return Interval(*(float(part[0]) for part in estimate(np.array(scores)[:, None])))
+
+
+def returns_after(runs: list[Run], seconds: float) -> np.ndarray:
+    """
+    :param runs: of one algorithm on one task
+    :param seconds: of training
+    :return: return of each run then; its last one if it has ended by then, shape (runs,)
+    """
+    return np.array([np.interp(seconds, run.seconds, run.returns) for run in runs])
+
+
+def training_seconds(runs: list[Run]) -> float:
+    """
+    :param runs: of one algorithm on one task
+    :return: median over runs of what the whole training takes
+    """
+    return float(np.median([run.seconds[-1] for run in runs]))
+
+
+def common_algorithms(runs: Runs) -> list[str]:
+    """
+    :param runs: of all tasks
+    :return: algorithms that have been run on every one of them
+    """
+    return [name for name in next(iter(runs.values()), {}) if all(name in own for own in runs.values())]
+
+
+def final_scores(runs: Runs) -> Scores:
+    """
+    :param runs: of all tasks
+    :return: scores of each algorithm that has all tasks, in units of sb3-contrib TRPO's
+    """
+    reference = [scores_of(own[TRPO]) for own in runs.values()]
+    return {name: normalized([scores_of(own[name]) for own in runs.values()], reference) for name in common_algorithms(runs)}
+
+
+def scores_after(runs: Runs, fraction: float) -> Scores:
+    """
+    :param runs: of all tasks
+    :param fraction: of the time that sb3-contrib's TRPO trains for on each task
+    :return: scores of each algorithm then, in units of sb3-contrib TRPO's at its end
+    """
+    reference = [scores_of(own[TRPO]) for own in runs.values()]
+    until = [fraction * training_seconds(own[TRPO]) for own in runs.values()]
+    return {
+        name: normalized(
+            [returns_after(own[name], seconds) for own, seconds in zip(runs.values(), until, strict=True)], reference
+        )
+        for name in common_algorithms(runs)
+    }
+
+
+class Reach(NamedTuple):
+    """
+    How soon ours is where sb3-contrib's TRPO ends. Infinite where the median run never gets there.
+
+    :param target: interquartile mean of TRPO's scores
+    :param steps: median of ours
+    :param seconds: median of ours
+    :param peer_seconds: median of TRPO, to get there for the first time
+    :param peer_training: median of TRPO, for the whole training
+    """
+
+    target: float
+    steps: float
+    seconds: float
+    peer_seconds: float
+    peer_training: float
+
+    @property
+    def part(self) -> float:
+        """Of TRPO's training."""
+        return self.seconds / self.peer_training
+
+
+def time_to_reach(own: dict[str, list[Run]]) -> Reach:
+    """
+    :param own: runs of one task by algorithm
+    :return: times until the first evaluation at or above the target
+    """
+    target = float(interquartile_mean(scores_of(own[TRPO])))
+    ours = np.array([first_reach(run, target) for run in own[OURS]])
+    peer = np.array([first_reach(run, target) for run in own[TRPO]])
+    steps, seconds = (float(_median(ours[:, column])) for column in (0, 1))
+    return Reach(target, steps, seconds, float(_median(peer[:, 1])), training_seconds(own[TRPO]))
+
+
+def _median(values: np.ndarray) -> float:
+    """Of several, infinite ones among them: no mean of one that is finite and one that is not."""
+    return float(np.sort(values)[len(values) // 2])

@@ -1,0 +1,22 @@
+"""The results page: text by hand, and between markers what comes from the results."""
+
+import re
+from collections.abc import Mapping
+
+from benchmarks.peers.errors import PeersError
+
+
+def filled(page: str, sections: Mapping[str, str]) -> str:
+    """
+    :param page: its text
+    :param sections: what belongs between the markers of each name; nothing where there are no results yet
+    :return: the text with these sections, and all else as it was
+    :raises PeersError: if a marker is missing
+    """
+    for name, content in sections.items():
+        between = re.compile(rf"(<!-- results: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
+        if len(between.findall(page)) != 1:
+            raise PeersError(f"`page` must have the markers of {name!r} once: <!-- results: {name} --> and <!-- end -->.")
+        body = f"\n{content}\n\n" if content else ""
+        page = between.sub(lambda match, body=body: match[1] + body + match[2], page)  # type: ignore[misc]
+    return page

@@ -1,0 +1,71 @@
+"""The results page and its figures, from the committed results and nothing else."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pandas as pd
+
+from benchmarks.peers import tables
+from benchmarks.peers.errors import PeersError
+from benchmarks.peers.page import filled
+from benchmarks.peers.table import read_results
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = DOCS / "benchmarks.md"
+IMAGES = DOCS / "images"
+
+_TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
+    "targets": tables.targets_table,
+    "scores": tables.scores_table,
+    "over tasks": tables.aggregate_table,
+    "clock": tables.clock_table,
+    "reach": tables.reach_table,
+    "classic": tables.classic_table,
+    "three million": tables.long_table,
+    "ablation": tables.ablation_table,
+    "origin": tables.origin_list,
+}
+#: title of each figure, by the section of the page that it stands in
+_FIGURES = {
+    "figure steps": ("peers_steps", "Return against steps on each task"),
+    "figure seconds": ("peers_seconds", "Return against seconds of training on each task"),
+    "figure over tasks": ("peers_over_tasks", "Interquartile mean over tasks, against steps and against time"),
+}
+
+
+def sections_of(table: pd.DataFrame) -> dict[str, str]:
+    """
+    :param table: of results
+    :return: Markdown by the name of the section
+    """
+    has_figures = bool(tables.scores_table(table))
+    drawn = {name: f"![{title}](images/{file}.svg)" * has_figures for name, (file, title) in _FIGURES.items()}
+    return {name: make(table) for name, make in _TABLES.items()} | drawn
+
+
+def write_report(page: Path = PAGE, images: Path = IMAGES) -> list[Path]:
+    """
+    :param page: to be filled
+    :param images: folder of the figures
+    :return: paths of what was written
+    :raises PeersError: if there are no results
+    """
+    table = read_results()
+    if table.empty:
+        raise PeersError("There are no results yet; run and export first: python -m benchmarks.peers run")
+    # The other commands would wait for it
+    from matplotlib import rc_context
+
+    from benchmarks.peers.figures import draw_all
+    from sb3_gae.sweep.figures.files import SUFFIXES, save_figure
+    from sb3_gae.sweep.figures.style import STYLE
+
+    page.write_text(filled(page.read_text(), sections_of(table)))
+    written = [page]
+    images.mkdir(parents=True, exist_ok=True)
+    with rc_context(STYLE):
+        for name, figure in draw_all(table).items():
+            for suffix in SUFFIXES:
+                save_figure(figure, images / f"{name}{suffix}")
+                written.append(images / f"{name}{suffix}")
+    return written

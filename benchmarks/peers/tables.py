@@ -1,0 +1,236 @@
+"""Markdown of the results page."""
+
+import math
+from collections.abc import Iterable, Sequence
+
+import pandas as pd
+
+from benchmarks.peers.aggregates import Interval, improvement, interquartile_means, normalized, ratio
+from benchmarks.peers.algorithms import ALGORITHMS, OURS, TRPO
+from benchmarks.peers.comparison import (
+    Runs,
+    common_algorithms,
+    final_scores,
+    mujoco_runs,
+    score,
+    scores_after,
+    time_to_reach,
+)
+from benchmarks.peers.curves import Run, all_runs, runs_of, scores_of
+from benchmarks.peers.plan import ABLATION_TASKS
+from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, PUBLISHED_PPO
+from benchmarks.peers.variants import VARIANTS
+from sb3_gae.sweep.statistics import interquartile_mean
+
+#: parts of sb3-contrib TRPO's training time at which scores are compared
+FRACTIONS = {"a fifth": 0.2, "half": 0.5, "all": 1.0}
+
+
+def scores_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: score of each algorithm on each MuJoCo task
+    """
+    runs = mujoco_runs(table)
+    names = [name for name in ALGORITHMS if any(name in own for own in runs.values())]
+    rows = [[task, *(_score(own.get(name)) for name in names)] for task, own in runs.items()]
+    return _markdown(["task", *(ALGORITHMS[name].title for name in names)], rows)
+
+
+def aggregate_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: interquartile mean over tasks, and how probably ours is better
+    """
+    runs = mujoco_runs(table)
+    scores = final_scores(runs) if runs else {}
+    rows = [
+        [
+            ALGORITHMS[name].title,
+            f"{len(scores[name])} × {len(runs)}",
+            _decimal(mean),
+            "" if name == OURS else _decimal(improvement(scores[OURS], scores[name])),
+            "" if name == OURS else _decimal(ratio(scores[OURS], scores[name])),
+        ]
+        for name, mean in interquartile_means(scores).items()
+    ]
+    return _markdown(["", "runs × tasks", "IQM", "probability that ours is better", "IQM of ours / its own"], rows)
+
+
+def clock_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: the same at equal seconds of training
+    """
+    runs = mujoco_runs(table)
+    if not runs:
+        return ""
+    found = {title: scores_after(runs, fraction) for title, fraction in FRACTIONS.items()}
+    means = {title: interquartile_means(scores) for title, scores in found.items()}
+    rows = []
+    for name in common_algorithms(runs):
+        better = ["" if name == OURS else _decimal(improvement(scores[OURS], scores[name])) for scores in found.values()]
+        cells = [part for title, chance in zip(found, better, strict=True) for part in (_decimal(means[title][name]), chance)]
+        rows.append([ALGORITHMS[name].title, *cells])
+    heads = [head for title in FRACTIONS for head in (f"IQM after {title}", "ours is better")]
+    return _markdown(["", *heads], rows)
+
+
+def reach_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: how soon ours reaches what sb3-contrib's TRPO ends with
+    """
+    rows = []
+    for task, own in mujoco_runs(table).items():
+        reach = time_to_reach(own)
+        steps = f"{reach.steps / 1000:.0f} 000" if math.isfinite(reach.steps) else "–"
+        times = [_seconds(value) for value in (reach.seconds, reach.peer_seconds, reach.peer_training)]
+        part = f"{reach.part:.2f}" if math.isfinite(reach.part) else "–"
+        rows.append([task, number(reach.target), steps, *times, part])
+    heads = ["task", "TRPO's final return", "steps of ours", "ours", "TRPO, first time", "TRPO, whole training"]
+    return _markdown([*heads, "ours / whole training"], rows)
+
+
+def classic_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: ours beside the zoo's trpo on classic control
+    """
+    rows = []
+    for task, steps in CLASSIC_TASKS.items():
+        own = all_runs(table, task, steps)
+        if OURS in own and TRPO in own:
+            rows.append([task, number(steps), _score(own[OURS]), _score(own[TRPO]), verdict(own)])
+    return _markdown(["task", "steps", ALGORITHMS[OURS].title, ALGORITHMS[TRPO].title, "at least as good"], rows)
+
+
+def verdict(own: dict[str, list[Run]]) -> str:
+    """
+    :param own: runs of one task by algorithm
+    :return: whether ours is at least as good as sb3-contrib's TRPO
+    """
+    ours, other = score(own[OURS]), score(own[TRPO])
+    if ours.point >= other.point:
+        return "yes"
+    return "no" if ours.high < other.low else "within the bands"
+
+
+def long_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: ours after three million steps beside what tianshou has published for PPO
+    """
+    rows = []
+    for task, published in PUBLISHED_PPO.items():
+        if runs := runs_of(table, task, OURS, LONG_STEPS):
+            above = "yes" if score(runs).point > published else "no"
+            rows.append([task, _score(runs), number(published), above])
+    return _markdown(["task", ALGORITHMS[OURS].title, "PPO, as tianshou has published it", "above"], rows)
+
+
+def ablation_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: score with each choice undone, beside the shipped settings with the same seeds
+    """
+    shipped = {task: runs_of(table, task, OURS, MUJOCO_STEPS) for task in ABLATION_TASKS}
+    rows = []
+    for variant, about in VARIANTS.items():
+        own = {task: runs_of(table, task, OURS, MUJOCO_STEPS, variant) for task in ABLATION_TASKS}
+        if any(own.values()) and all(shipped.values()):
+            rows.append([about.title, *(_score(runs) for runs in own.values()), _against(own, shipped)])
+    return _markdown(["", *ABLATION_TASKS, "IQM over tasks, as shipped = 1"], rows if len(rows) > 1 else [])
+
+
+def _against(own: dict[str, list[Run]], shipped: dict[str, list[Run]]) -> str:
+    if not all(own.values()):
+        return ""
+    scores = [scores_of(runs) for runs in own.values()]
+    return _decimal(interquartile_means({"": normalized(scores, [scores_of(runs) for runs in shipped.values()])})[""])
+
+
+def targets_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: each target, what was measured, and whether it is met
+    """
+    runs = mujoco_runs(table)
+    rows = [*_mujoco_targets(runs)] if runs else []
+    classic = {task: all_runs(table, task, steps) for task, steps in CLASSIC_TASKS.items()}
+    if complete := {task: own for task, own in classic.items() if OURS in own and TRPO in own}:
+        short = [task for task, own in complete.items() if verdict(own) != "yes"]
+        measured = f"{len(complete) - len(short)} of {len(complete)} tasks" + (f"; not {', '.join(short)}" if short else "")
+        rows.append(["classic control: at least as good as the zoo's trpo", measured, _met(not short)])
+    long = {task: runs_of(table, task, OURS, LONG_STEPS) for task in PUBLISHED_PPO}
+    if found := {task: score(own).point for task, own in long.items() if own}:
+        below = [task for task, value in found.items() if value <= PUBLISHED_PPO[task]]
+        measured = ", ".join(f"{task} {number(value)}" for task, value in found.items())
+        rows.append(["3 million steps: above tianshou's published PPO", measured, _met(not below)])
+    return _markdown(["target", "measured", "met"], rows)
+
+
+def _mujoco_targets(runs: Runs) -> Iterable[list[str]]:
+    scores = final_scores(runs)
+    means = {name: mean.point for name, mean in interquartile_means(scores).items() if name != OURS}
+    best = max(means, key=lambda name: means[name])
+    factor = ratio(scores[OURS], scores[best])
+    title = ALGORITHMS[best].title
+    yield ["IQM over tasks at least 1.3 times the best peer's", f"{_decimal(factor)} ({title})", _met(factor.point >= 1.3)]
+    under = [task for task, own in runs.items() if verdict(own) == "no"]
+    yield ["no task under sb3-contrib's TRPO by more than the bands", ", ".join(under) or "none is", _met(not under)]
+    parts = {task: time_to_reach(own).part for task, own in runs.items()}
+    slow = [f"{task} {part:.2f}" if math.isfinite(part) else f"{task} never" for task, part in parts.items() if part > 0.2]
+    yield ["its final return in a fifth of its time", "not on " + ", ".join(slow) if slow else "on all", _met(not slow)]
+
+
+def origin_list(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: versions and machines that the results are from
+    """
+    if table.empty:
+        return ""
+    names = {"processor": "processor", "cores": "cores", "cores_of_run": "cores of a run", "python": "Python"}
+    names |= {name: name.replace("_", "-") for name in ("sb3_gae", "sb3_contrib", "stable_baselines3", "rl_zoo3", "tianshou")}
+    names |= {name: name for name in ("gymnasium", "mujoco", "envpool", "torch")}
+    held = {
+        title: sorted({str(value) for value in table[name] if value != ""}) for name, title in names.items() if name in table
+    }
+    return "\n".join(f"- {title}: {', '.join(values)}" for title, values in held.items() if values)
+
+
+def number(value: float) -> str:
+    """
+    :param value: any
+    :return: whole, with spaces between thousands; two digits behind the point if it is small
+    """
+    return f"{value:.2f}" if abs(value) < 10 else f"{value:,.0f}".replace(",", " ")
+
+
+def _score(runs: list[Run] | None) -> str:
+    if not runs:
+        return ""
+    if len(runs) == 1:
+        return f"{number(float(interquartile_mean(scores_of(runs))))} (1 run)"
+    found = score(runs)
+    return f"{number(found.point)} [{number(found.low)}, {number(found.high)}] ({len(runs)})"
+
+
+def _decimal(interval: Interval) -> str:
+    return f"{interval.point:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.0f} s" if math.isfinite(value) else "never"
+
+
+def _met(is_met: bool) -> str:
+    return "yes" if is_met else "**no**"
+
+
+def _markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Nothing at all where there are no rows: a table without numbers would be read as one with."""
+    if not rows:
+        return ""
+    return "\n".join("| " + " | ".join(row) + " |" for row in (heads, ["---"] * len(heads), *rows))

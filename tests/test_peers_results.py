@@ -1,0 +1,218 @@
+"""What is made of the results of the benchmark against peers."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib import rc_context
+from peers_data import ENDS, SEEDS, TASKS, a_run, results
+from rliable import metrics
+
+from benchmarks.peers import aggregates, report
+from benchmarks.peers.aggregates import improvement, interquartile_means, normalized, probability_of_improvement, ratio
+from benchmarks.peers.algorithms import OURS, PPO, TRPO
+from benchmarks.peers.comparison import final_scores, mujoco_runs, scores_after, time_to_reach
+from benchmarks.peers.curves import Run, against_seconds, against_steps, first_reach, runs_of, scores_of
+from benchmarks.peers.errors import PeersError
+from benchmarks.peers.figures import draw_all
+from benchmarks.peers.journal import Journal, State, journal_path
+from benchmarks.peers.page import filled
+from benchmarks.peers.plan import Cell
+from benchmarks.peers.protocol import EVALUATIONS, MUJOCO_STEPS
+from benchmarks.peers.table import export, gather, read_results
+from benchmarks.peers.tables import number
+from sb3_gae.sweep.figures.style import STYLE
+from sb3_gae.sweep.statistics import estimate
+
+TABLE = results()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_resamples() -> Iterator[None]:
+    """What the numbers mean is not at stake here, and they take their time."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(aggregates, "RESAMPLES", 100)
+        patch.setattr(estimate, "__defaults__", (100,))
+        yield
+
+
+@pytest.fixture(scope="module")
+def sections() -> dict[str, str]:
+    return report.sections_of(TABLE)
+
+
+def rows_of(section: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines()[2:]]
+
+
+def test_runs_are_in_order() -> None:
+    runs = runs_of(TABLE.sample(frac=1, random_state=0), "Hopper-v5", TRPO, MUJOCO_STEPS)
+    assert [run.seed for run in runs] == list(range(SEEDS))
+    assert all((np.diff(run.steps) > 0).all() for run in runs)
+    np.testing.assert_allclose(scores_of(runs), ENDS[TRPO][0] + np.arange(SEEDS))
+    assert runs_of(TABLE, "Hopper-v5", TRPO, 5) == []
+
+
+def test_a_score_is_the_mean_of_the_last_tenth() -> None:
+    returns = np.zeros(EVALUATIONS + 1)
+    returns[-4:] = [1, 2, 3, 6]
+    returns[3] = 100
+    assert Run(0, np.arange(EVALUATIONS + 1), np.zeros(EVALUATIONS + 1), returns).score == 3
+
+
+def test_curves_are_on_a_common_grid() -> None:
+    late = Run(0, np.array([0.0, 60, 110]), np.array([0.0, 6, 11]), np.array([0.0, 60, 110]))
+    early = Run(1, np.array([0.0, 50, 100]), np.array([0.0, 10, 20]), np.array([0.0, 0, 100]))
+    grid, returns = against_steps([late, early], 100)
+    assert (grid[0], grid[-1], returns.shape) == (0, 100, (2, EVALUATIONS + 1))
+    np.testing.assert_allclose(returns[0], grid)
+    seconds, returns = against_seconds([late, early])
+    assert seconds[-1] == 11
+    np.testing.assert_allclose(returns[:, -1], [110, 10])
+
+
+def test_first_reach() -> None:
+    run = Run(0, np.array([0.0, 10, 20]), np.array([0.0, 1, 2]), np.array([0.0, 5, 4]))
+    assert first_reach(run, 4.5) == (10, 1)
+    assert first_reach(run, 6) == (np.inf, np.inf)
+
+
+def test_time_to_reach_is_part_of_the_peers_training() -> None:
+    reach = time_to_reach(mujoco_runs(TABLE)["Hopper-v5"])
+    assert reach.target == pytest.approx(2001)
+    # Ours climbs to 3 000 within 50 s, and is evaluated every 2.5 s; TRPO is there after half of its 400 s
+    assert reach.seconds == pytest.approx(35)
+    assert reach.peer_seconds == pytest.approx(200)
+    assert reach.part == pytest.approx(35 / 400)
+
+
+def test_scores_are_in_units_of_the_peers() -> None:
+    runs = mujoco_runs(TABLE)
+    assert list(runs) == list(TASKS)
+    scores = final_scores(runs)
+    assert list(scores) == [OURS, TRPO, PPO]
+    assert scores[OURS].shape == (SEEDS, len(TASKS))
+    means = interquartile_means(scores)
+    assert means[TRPO].point == pytest.approx(1, abs=1e-3)
+    assert means[OURS].point == pytest.approx(1.5, abs=1e-3)
+    assert ratio(scores[OURS], scores[PPO]).point == pytest.approx(2, abs=1e-3)
+    # After a twentieth of TRPO's time ours has climbed a fifth of the way and more
+    assert interquartile_means(scores_after(runs, 0.05))[OURS].point == pytest.approx(0.4 * 1.5, rel=1e-2)
+
+
+def test_a_unit_must_be_positive() -> None:
+    with pytest.raises(PeersError, match="`reference` must be positive"):
+        normalized([np.array([1.0])], [np.array([-1.0])])
+
+
+def test_probability_of_improvement_is_rliables() -> None:
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(0, 4, (5, 3)).astype(float), rng.integers(0, 4, (4, 3)).astype(float)
+    expected = metrics.probability_of_improvement(first, second)
+    assert probability_of_improvement(first, second) == pytest.approx(expected)
+    interval = improvement(first, second)
+    assert interval.point == pytest.approx(expected)
+    assert interval.low < interval.point < interval.high
+
+
+def test_tables_say_what_the_results_say(sections: dict[str, str]) -> None:
+    assert rows_of(sections["scores"])[1] == [
+        "Hopper-v5",
+        "3 001 [3 000, 3 002] (3)",
+        "2 001 [2 000, 2 002] (3)",
+        "1 501 [1 500, 1 502] (3)",
+        "",
+    ]
+    assert [row[:2] for row in rows_of(sections["over tasks"])] == [
+        ["TRPOGAE (ours)", "3 × 2"],
+        ["TRPO, sb3-contrib", "3 × 2"],
+        ["PPO, SB3", "3 × 2"],
+    ]
+    assert rows_of(sections["over tasks"])[1][3] == "1.00 [1.00, 1.00]"
+    assert rows_of(sections["classic"])[0][0::4] == ["CartPole-v1", "no"]
+    assert rows_of(sections["three million"])[0][0::2] == ["Ant-v5", "4 079"]
+    assert rows_of(sections["ablation"])[1][0] == "Monte-Carlo targets, not λ-returns"
+    assert rows_of(sections["ablation"])[1][-1].startswith("0.50 ")
+    assert rows_of(sections["reach"])[1] == ["Hopper-v5", "2 001", "350 000", "35 s", "200 s", "400 s", "0.09"]
+    assert rows_of(sections["clock"])[0][2] == ""
+    assert "- processor: a processor" in sections["origin"]
+
+
+def test_targets_are_met_or_not(sections: dict[str, str]) -> None:
+    met = {row[0]: row[-1] for row in rows_of(sections["targets"])}
+    assert list(met.values()) == ["yes", "yes", "yes", "**no**", "yes"]
+
+
+def test_nothing_is_shown_where_there_are_no_results() -> None:
+    assert set(report.sections_of(read_results(Path("nowhere"))).values()) == {""}
+
+
+def test_figures() -> None:
+    with rc_context(STYLE):
+        figures = draw_all(TABLE)
+        for figure in figures.values():
+            figure.canvas.draw()
+    assert list(figures) == ["peers_steps", "peers_seconds", "peers_over_tasks"]
+    assert len(figures["peers_steps"].axes) == len(TASKS)
+    assert draw_all(TABLE.iloc[:0]) == {}
+
+
+def test_numbers() -> None:
+    assert [number(value) for value in (6053.4, -12.5, 9.876, 1234567)] == ["6 053", "-12", "9.88", "1 234 567"]
+
+
+def test_the_page_keeps_what_is_not_between_markers() -> None:
+    page = "a\n<!-- results: one -->\nold\n<!-- end -->\nb\n<!-- results: two -->\n<!-- end -->\nc\n"
+    new = filled(page, {"one": "| new |", "two": ""})
+    assert new == "a\n<!-- results: one -->\n\n| new |\n\n<!-- end -->\nb\n<!-- results: two -->\n<!-- end -->\nc\n"
+    assert filled(new, {"one": ""}).startswith("a\n<!-- results: one -->\n<!-- end -->\nb")
+    with pytest.raises(PeersError, match="`page` must have the markers of 'three' once"):
+        filled(page, {"three": ""})
+
+
+def test_export_keeps_runs_that_are_not_here(tmp_path: Path) -> None:
+    def run(cell: Cell, value: float, status: State = State.DONE) -> None:
+        journal = Journal(journal_path(tmp_path / "logs", cell))
+        start = {"cell": list(cell), "settings": {"gamma": 1}, "settings_hash": "abc", "origin": {"torch": "2"}, "time": 0}
+        journal.begin(start)
+        journal.evaluated({"steps": 0, "mean_return": value, "wall_seconds": 0.0})
+        journal.evaluated({"steps": 1000, "mean_return": value, "wall_seconds": 1.0})
+        journal.end(status, "a reason")
+        journal.close()
+
+    cell = Cell("Hopper-v5", OURS, "", 0, 1000)
+    run(cell, 1.0)
+    run(cell._replace(seed=1), 2.0)
+    run(cell._replace(seed=2), 3.0, State.FAILED)
+    table, failures = gather(tmp_path / "logs")
+    assert failures == [f"{cell._replace(seed=2).name}: a reason"]
+    (path,) = export(table, tmp_path)
+    assert path.name == "Hopper-v5.parquet"
+    journal_path(tmp_path / "logs", cell).unlink()
+    run(cell._replace(seed=1), 5.0)
+    export(gather(tmp_path / "logs")[0], tmp_path)
+    stored = read_results(tmp_path)
+    assert list(stored["seed"]) == [0, 0, 1, 1]
+    assert list(stored["mean_return"]) == [1.0, 1.0, 5.0, 5.0]
+    assert list(stored["step"]) == [0, 1000, 0, 1000]
+    with pytest.raises(PeersError, match="nothing to export"):
+        export(pd.DataFrame(), tmp_path)
+
+
+def test_a_report_without_results_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "read_results", lambda: read_results(tmp_path))
+    with pytest.raises(PeersError, match="no results yet"):
+        report.write_report(tmp_path / "page.md", tmp_path)
+
+
+def test_a_report_is_a_page_and_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = pd.concat([a_run("Hopper-v5", name, seed, MUJOCO_STEPS) for name in (OURS, TRPO) for seed in (0, 1)])
+    monkeypatch.setattr(report, "read_results", lambda: few)
+    page = tmp_path / "page.md"
+    page.write_text(report.PAGE.read_text())
+    written = report.write_report(page, tmp_path)
+    assert "![Return against steps on each task](images/peers_steps.svg)" in page.read_text()
+    assert {path.name for path in written} >= {"page.md", "peers_steps.svg", "peers_steps.png"}
+    assert all(path.stat().st_size > 0 for path in written)
