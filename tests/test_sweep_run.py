@@ -2,6 +2,7 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.ledger import Outcome, Status
 from sb3_gae.sweep.plan import Options
 from sb3_gae.sweep.recorder import COLUMNS, Row
+from sb3_gae.sweep.worker import return_freed_memory
 
 HERE = Path(__file__).parent
 TINY = {"n_envs": 1, "n_steps": 32, "policy_kwargs": {"net_arch": [4]}}
@@ -217,3 +219,16 @@ def test_what_cannot_be_run_is_refused_before_anything_is_stored(changes: dict[s
         run_sweep(seeds=1, **GRID | changes, progress=False)
     assert message in str(error.value) and "\n" not in str(error.value)
     assert not Path("logs").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_memory_that_a_cell_has_freed_goes_back_to_the_system() -> None:
+    def resident_mib() -> float:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 2**20
+
+    # Small enough for the heap, and every second one is kept, so that glibc gives nothing back by itself
+    blocks = [bytearray(b"x" * 100_000) for _ in range(2_000)]
+    del blocks[::2]
+    before = resident_mib()
+    return_freed_memory()
+    assert resident_mib() < before - 50.0

@@ -1,5 +1,8 @@
 """A process that runs one cell after another until none is to be had."""
 
+import contextlib
+import ctypes
+import gc
 import math
 import multiprocessing
 import signal
@@ -24,6 +27,8 @@ from sb3_gae.sweep.study import Claim, SweepStudy, TakenOverError
 _STORE_EVERY = 5.0
 #: seconds between signs of life, far below what counts as silence
 _BEAT_EVERY = 60.0
+#: seconds that a cell must have taken for its memory to be worth a search
+_LONG_CELL = 30.0
 
 
 class StoppedError(Exception):
@@ -78,9 +83,23 @@ def work(plan: Plan, stop: StopRequest) -> None:
     try:
         study = SweepStudy(plan.name, plan.location, silent_after=plan.silent_after)
         while not stop.is_set() and (claim := study.claim(plan.cells)) is not None:
+            start = time.monotonic()
             run_claim(claim, plan.options, stop)
+            if time.monotonic() - start > _LONG_CELL:
+                return_freed_memory()
     finally:
         th.set_num_threads(n_threads)
+
+
+def return_freed_memory() -> None:
+    """
+    Give the system what a cell has freed. glibc would keep it, in pieces that the next cell's batches do not fit into, so that
+    a process grows by hundreds of MiB with each cell of a robot.
+    """
+    gc.collect()
+    # Other C libraries have no such function, and Windows has no handle for the process
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def work_as_process(plan: Plan, messages: Any) -> None:

@@ -1,0 +1,153 @@
+"""
+Turns red when speed or learning have got worse than what is recorded of unchanged code.
+
+    python -m benchmarks.gate                     # some minutes; exit status 1 if a number is outside its band
+    python -m benchmarks.gate --keep              # also adds the numbers to the history
+    python -m benchmarks.gate record              # records anew what the bands are made from (half an hour)
+    python -m benchmarks.gate prove               # plants one fault after the other; fails unless each is noticed
+    python -m benchmarks.gate repeat --times 20   # how often unchanged code is red
+    python -m benchmarks.gate draw                # the history as a figure
+
+A mean of learning scores may be four standard errors off, a ratio of times 15 % above the largest recorded one. An
+improvement that leaves a band is to be recorded anew, on purpose.
+"""
+
+import argparse
+import datetime
+from collections.abc import Sequence
+
+import numpy as np
+
+from benchmarks.gate.bands import Band, verdicts
+from benchmarks.gate.learning import RUNS, SEEDS, learning_scores
+from benchmarks.gate.plants import PLANTS
+from benchmarks.gate.records import add_to_history, bands, read_records, write_records
+from benchmarks.gate.speed import speed_ratios
+from sb3_gae.sweep.provenance import provenance
+
+PARTS = ("speed", "learning")
+RECORDED_SEEDS, RECORDED_ROUNDS = range(100, 120), 10
+
+
+def measure(part: str) -> dict[str, float]:
+    """
+    :param part: of the gate
+    :return: what the gate judges, by name
+    """
+    if part == "speed":
+        return speed_ratios()
+    return {name: float(np.mean(learning_scores(name))) for name in RUNS}
+
+
+def check(parts: Sequence[str], keep: bool = False, quiet: bool = False) -> bool:
+    """
+    Measure, compare and print.
+
+    :param parts: of the gate
+    :param keep: whether to add the numbers to the history
+    :param quiet: whether to print what is outside its band alone
+    :return: whether every number is within its band
+    """
+    records = read_records()
+    good = True
+    for part in parts:
+        measured, limits = measure(part), bands(records, part, len(SEEDS))
+        holds = verdicts(measured, limits)
+        good = good and all(holds.values())
+        for name, value in measured.items():
+            if not (quiet and holds[name]):
+                print(line(part, name, value, limits[name]), flush=True)
+        if keep:
+            remember(part, measured, limits)
+    return good
+
+
+def line(part: str, name: str, value: float, band: Band) -> str:
+    """:return: one number with its band, for people"""
+    unit = "return" if part == "learning" else "ratio"
+    within = f"at most {band.high:.3g}" if band.low == 0.0 else f"from {band.low:.3g} to {band.high:.3g}"
+    return f"{'ok ' if band.holds(value) else 'RED'} {name:<34} {unit} {value:8.3g}   {within}"
+
+
+def remember(part: str, measured: dict[str, float], limits: dict[str, Band]) -> None:
+    """Add numbers to the history, with today's date and the commit."""
+    common = {"date": datetime.datetime.now(datetime.UTC).date().isoformat(), "commit": provenance()["commit"], "part": part}
+    add_to_history(
+        [
+            common
+            | {"name": name, "value": f"{value:.4g}", "low": f"{limits[name].low:.4g}", "high": f"{limits[name].high:.4g}"}
+            for name, value in measured.items()
+        ]
+    )
+
+
+def record(parts: Sequence[str]) -> None:
+    """Record what the bands are made from; learning with seeds that the gate itself does not use."""
+    try:
+        records = read_records()
+    except FileNotFoundError:
+        records = {}
+    if "speed" in parts:
+        rounds = [speed_ratios() for _ in range(RECORDED_ROUNDS)]
+        records["speed"] = {name: [round(each[name], 4) for each in rounds] for name in rounds[0]}
+    if "learning" in parts:
+        records["learning"] = {
+            name: {str(seed): round(learning_scores(name, [seed])[0], 2) for seed in RECORDED_SEEDS} for name in RUNS
+        }
+    records["of"] = provenance()
+    write_records(records)
+
+
+def prove(names: Sequence[str]) -> bool:
+    """
+    :param names: of plants
+    :return: whether the gate noticed each
+    """
+    noticed = {}
+    for name in names:
+        plant, part = PLANTS[name]
+        print(f"--- {name}: the part '{part}' must turn red")
+        with plant():
+            noticed[name] = not check([part])
+    for name, was_noticed in noticed.items():
+        print(f"{'noticed' if was_noticed else 'MISSED '} {name}")
+    return all(noticed.values())
+
+
+def repeat(parts: Sequence[str], times: int) -> bool:
+    """
+    :param parts: of the gate
+    :param times: how often
+    :return: whether it was never red
+    """
+    n_red = sum(not check(parts, quiet=True) for _ in range(times))
+    print(f"{n_red} of {times} runs were red")
+    return n_red == 0
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("verb", nargs="?", default="check", choices=["check", "record", "prove", "repeat", "draw"])
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--plants", nargs="+", choices=list(PLANTS), default=list(PLANTS), help="of prove")
+    parser.add_argument("--times", type=int, default=20, help="of repeat")
+    parser.add_argument("--keep", action="store_true", help="add what check measures to the history")
+    args = parser.parse_args()
+    if args.verb == "record":
+        record(args.parts)
+        return 0
+    if args.verb == "draw":
+        from benchmarks.gate.history import draw
+
+        print(draw())
+        return 0
+    good = {
+        "check": lambda: check(args.parts, args.keep),
+        "prove": lambda: prove(args.plants),
+        "repeat": lambda: repeat(args.parts, args.times),
+    }[args.verb]()
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

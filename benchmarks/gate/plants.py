@@ -1,0 +1,63 @@
+"""Faults that the gate has to notice, each of them in force within a `with` statement."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+from unittest import mock
+
+from sb3_gae import TRPOGAE, GAERolloutBuffer, trust_region
+from sb3_gae.collection import ActionSampler
+
+
+def twice(function: Callable[..., Any]) -> Callable[..., Any]:
+    """
+    :param function: any
+    :return: does all the work two times
+    """
+
+    def doubled(*args: Any, **kwargs: Any) -> Any:
+        function(*args, **kwargs)
+        return function(*args, **kwargs)
+
+    return doubled
+
+
+def doubled_conjugate_gradient() -> AbstractContextManager[Any]:
+    """Every linear system is solved twice."""
+    return mock.patch.object(trust_region, "conjugate_gradient", twice(trust_region.conjugate_gradient))
+
+
+def doubled_actions() -> AbstractContextManager[Any]:
+    """The policy is asked twice at each step of a rollout."""
+    return mock.patch.object(ActionSampler, "__call__", twice(ActionSampler.__call__))
+
+
+def wrong_sign() -> AbstractContextManager[Any]:
+    """Advantages are negated."""
+    compute = GAERolloutBuffer.compute_returns_and_advantage
+
+    def negated(self: GAERolloutBuffer, *args: Any, **kwargs: Any) -> None:
+        compute(self, *args, **kwargs)
+        self.advantages = -self.advantages
+
+    return mock.patch.object(GAERolloutBuffer, "compute_returns_and_advantage", negated)
+
+
+def value_first() -> AbstractContextManager[Any]:
+    """The value function is fitted before the policy step, which takes its advantages from it."""
+    train = TRPOGAE.train
+
+    def in_the_other_order(self: TRPOGAE) -> None:
+        self.value_fit_first = True
+        train(self)
+
+    return mock.patch.object(TRPOGAE, "train", in_the_other_order)
+
+
+#: by name, with the parts of the gate that ought to notice
+PLANTS: dict[str, tuple[Callable[[], AbstractContextManager[Any]], str]] = {
+    "doubled-cg": (doubled_conjugate_gradient, "speed"),
+    "doubled-actions": (doubled_actions, "speed"),
+    "wrong-sign": (wrong_sign, "learning"),
+    "value-first": (value_first, "learning"),
+}

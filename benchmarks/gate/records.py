@@ -1,0 +1,55 @@
+"""What was recorded of unchanged code, and the history of what the gate measured, in files of the repository."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+from benchmarks.gate.bands import Band, learning_band, speed_band
+
+RESULTS = Path(__file__).parents[1] / "results"
+#: what the bands are derived from: scores of each learning run by seed, ratios of each speed by run
+RECORDS = RESULTS / "gate.json"
+#: a row for each number of each recorded commit
+HISTORY = RESULTS / "gate_history.csv"
+HISTORY_COLUMNS = ("date", "commit", "part", "name", "value", "low", "high")
+
+
+def read_records() -> dict[str, Any]:
+    """
+    :return: ``{"learning": {name: {seed: score}}, "speed": {name: [ratio]}}``
+    :raises FileNotFoundError: if nothing was ever recorded
+    """
+    return json.loads(RECORDS.read_text())
+
+
+def write_records(records: dict[str, Any]) -> None:
+    """
+    :param records: as :func:`read_records` returns them
+    """
+    RECORDS.parent.mkdir(exist_ok=True)
+    RECORDS.write_text(json.dumps(records, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
+
+
+def bands(records: dict[str, Any], part: str, n_seeds: int) -> dict[str, Band]:
+    """
+    :param records: as :func:`read_records` returns them
+    :param part: ``"speed"`` or ``"learning"``
+    :param n_seeds: of the means that are judged
+    :return: by name
+    """
+    if part == "learning":
+        return {name: learning_band(list(scores.values()), n_seeds) for name, scores in records["learning"].items()}
+    return {name: speed_band(ratios) for name, ratios in records["speed"].items()}
+
+
+def add_to_history(rows: list[dict[str, Any]]) -> None:
+    """
+    :param rows: with the keys of :data:`HISTORY_COLUMNS`
+    """
+    new = not HISTORY.exists()
+    with HISTORY.open("a", newline="") as file:
+        writer = csv.DictWriter(file, HISTORY_COLUMNS, lineterminator="\n")
+        if new:
+            writer.writeheader()
+        writer.writerows(rows)

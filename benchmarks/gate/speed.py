@@ -1,0 +1,98 @@
+"""Speed as ratios of times in one process, the two in turn, so that a slow or busy machine changes them little."""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+from benchmarks.update_speed import Update, ours, theirs
+from sb3_gae import TRPOGAE
+from sb3_gae.batch import standardized
+from sb3_gae.collection import training_batch
+from sb3_gae.vec_env.choice import batched_vec_env
+
+BATCH = 12_288
+N_ENVS, N_STEPS = 64, 64
+ROUNDS = 9
+
+
+def speed_ratios() -> dict[str, float]:
+    """
+    :return: by name; the smaller the faster
+    """
+    th.set_num_threads(1)
+    return update_ratios() | rollout_ratio()
+
+
+def update_ratios() -> dict[str, float]:
+    """
+    :return: an update over that of sb3-contrib's TRPO on the same rollout; policy step and value fit over a forward and
+        backward pass of both networks; a grid of 16 advantages over one pass
+    """
+    model = ours(BATCH)
+    update, peer = Update(model), Update(theirs(model))
+    batch = training_batch(model.rollout_buffer, model.action_space)
+    parameters = model._parameter_groups(batch)
+    buffer, lambdas = model.rollout_buffer, np.linspace(0.85, 1.0, 16)
+    times = least_seconds(
+        {
+            "update": (update, update.rewind),
+            "peer": (peer, peer.rewind),
+            "policy": (lambda: model._step_policy(batch, parameters), update.rewind),
+            "value": (lambda: model._fit_value(batch, parameters), update.rewind),
+            "passes": (lambda: forward_and_backward(model), None),
+            "grid": (lambda: buffer.advantage_grid([0.99], lambdas), None),
+            "single": (lambda: buffer.advantage_grid([0.99], lambdas[:1]), None),
+        }
+    )
+    return {
+        "update / sb3-contrib's": times["update"] / times["peer"],
+        "policy step / passes": times["policy"] / times["passes"],
+        "value fit / passes": times["value"] / times["passes"],
+        "16 advantages / 1": times["grid"] / times["single"],
+    }
+
+
+def rollout_ratio() -> dict[str, float]:
+    """
+    :return: a rollout of the biped over stepping the same environments with given actions
+    """
+    env = make_vec_env("GaeBiped-v0", N_ENVS, seed=0, vec_env_cls=batched_vec_env, vec_env_kwargs={"n_threads": 1})
+    model = TRPOGAE("MlpPolicy", env, n_steps=N_STEPS, seed=0, device="cpu")
+    _, callback = model._setup_learn(N_ENVS * N_STEPS)
+    callback.on_training_start(locals(), globals())
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (N_STEPS, N_ENVS, *env.action_space.shape)).astype(np.float32)
+    times = least_seconds(
+        {
+            "rollout": (lambda: model.collect_rollouts(model.env, callback, model.rollout_buffer, N_STEPS), None),
+            "physics": (lambda: [env.step(action) for action in actions], None),
+        }
+    )
+    return {"rollout / physics": times["rollout"] / times["physics"]}
+
+
+def forward_and_backward(model: TRPOGAE) -> None:
+    """What one step of plain gradient descent costs: the unit for the parts of an update."""
+    buffer = model.rollout_buffer
+    samples = buffer.batch()
+    values, log_prob, _ = model.policy.evaluate_actions(samples.observations, samples.actions)
+    loss = (standardized(samples.advantages) * log_prob).mean() + (values.flatten() - samples.returns).square().mean()
+    th.autograd.grad(loss, [parameter for parameter in model.policy.parameters() if parameter.requires_grad])
+
+
+def least_seconds(actions: dict[str, tuple[Callable[[], object], Callable[[], None] | None]]) -> dict[str, float]:
+    """
+    :param actions: what to time, and what puts things back before it
+    :return: the least time of each in rounds of all of them, in seconds; noise only ever adds to it
+    """
+    least = dict.fromkeys(actions, np.inf)
+    for _ in range(ROUNDS):
+        for name, (action, before) in actions.items():
+            if before is not None:
+                before()
+            start = time.perf_counter()
+            action()
+            least[name] = min(least[name], time.perf_counter() - start)
+    return least
