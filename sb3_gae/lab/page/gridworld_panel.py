@@ -37,14 +37,14 @@ class GridworldPanel:
         with ui.element("div").classes("columns three"):
             with ui.element("div").classes("stack"):
                 with panel("Return, in parts of the best possible (dashed)"):
-                    self._returns = picture()
+                    self._returns = picture("returns")
                 self._grid = GridPanel(self._moment)
             with ui.element("div").classes("stack"):
                 self._build_knobs()
                 with panel("Bias: angle between expected and true gradient, in radians (exact)"):
-                    self._bias = picture()
+                    self._bias = picture("bias")
                 with panel("Variance of the batch's gradient (exact)"):
-                    self._variance = picture()
+                    self._variance = picture("variance")
             with ui.element("div").classes("stack wide"):
                 self._build_estimator()
                 self._build_log()
@@ -124,7 +124,7 @@ class GridworldPanel:
                 "One sampled episode of the coming step. Slate: residuals δ. Clay: the same, weighted with (γλ)^l (the curve) "
                 "and added up to the advantage of the chosen step."
             ).classes("faint")
-            self._trace = picture()
+            self._trace = picture("trace")
             self._episode_knob = Knob("episode of the batch", 1, 20, 1, 1, self._choose_episode, "episode")
             self._start_knob = Knob("step of the episode", 0, 20, 1, 0, self._choose_start, "start")
             self._share = ui.label("")

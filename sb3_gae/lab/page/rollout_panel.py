@@ -68,11 +68,11 @@ class RolloutPanel:
     def _build_advantages(self) -> None:
         with panel("Advantages along the trajectory"):
             ui.label("Line: with the λ of the dial. Dashed: with λ = 1. Bars: residuals δ.").classes("faint")
-            self._advantages = picture()
+            self._advantages = picture("advantages")
 
     def _build_statistics(self) -> None:
         with panel("Bias² (solid) and variance (dashed) of the batch's policy gradient for each λ"):
-            self._trade_off = picture()
+            self._trade_off = picture("trade-off")
             self._summary = ui.label("").classes("faint")
             self._summary.props["data-test"] = "rollout-summary"
         with panel("Response of the policy gradient by delay"):
@@ -80,7 +80,7 @@ class RolloutPanel:
                 "‖E[∇log π · x at l steps later]‖²: what remains of the response function χ(l) where states do not recur. "
                 "Slate: rewards. Clay: residuals, which V has shaped. Curve: the weights (γλ)^l. Each in units of its largest."
             ).classes("faint")
-            self._response = picture()
+            self._response = picture("response")
 
     def _turn_lambda(self, value: Any) -> None:
         if isinstance(value, int | float) and 0.0 <= value <= 1.0:

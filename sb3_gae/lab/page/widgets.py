@@ -27,6 +27,7 @@ class Knob:
             with ui.element("div").classes("knob-name"):
                 ui.label(name)
                 self._shown = ui.label(f"{value:g}")
+                self._shown.props["data-test"] = f"{marker}-shown"
             self.slider = ui.slider(min=low, max=high, step=step, value=value, on_change=lambda event: self._turn(event.value))
             self.slider.props["aria-label"] = name
             self.slider.props["data-test"] = marker
@@ -85,9 +86,14 @@ def put(element: ui.element, **props: Any) -> None:
         element.props.update(new)
 
 
-def picture() -> ui.html:
-    """:return: a place for the SVG of :mod:`sb3_gae.lab.pictures`, which needs no sanitizing as it is made of numbers"""
-    return ui.html("", sanitize=False).classes("w-full")
+def picture(marker: str) -> ui.html:
+    """
+    :param marker: for tests, to find it by
+    :return: a place for the SVG of :mod:`sb3_gae.lab.pictures`, which needs no sanitizing as it is made of numbers
+    """
+    place = ui.html("", sanitize=False).classes("w-full")
+    place.props["data-test"] = marker
+    return place
 
 
 @contextmanager
