@@ -61,7 +61,8 @@ def test_pictures_hold_what_they_are_given() -> None:
     axes = Axes("a label", (0.0, 10.0), (0.0, 1.0))
     picture = line_chart(axes, [Line(np.arange(1000) / 100, np.append(np.full(999, 0.5), np.nan), "return")], marks=[3.0])
     assert 'aria-label="a label"' in picture and picture.count("<polyline") == 1 and "nan" not in picture
-    assert bar_chart(Axes("b", (-0.5, 2.5), (-1.0, 1.0)), [np.array([1.0, -1.0, 0.0])], ["delta"]).count("<rect") == 3
+    bars = bar_chart(Axes("b", (-0.5, 2.5), (-1.0, 1.0)), [np.array([1.0, -1.0, 0.0])], ["delta"])
+    assert bars.count('<path class="bar delta"') == 1 and bars.count("M") == 3
     assert [round_up(value) for value in (0.0, 0.03, 1.0, 7.0, np.inf)] == pytest.approx([1.0, 0.05, 1.0, 10.0, 1.0])
     probabilities = np.array([0.1, 0.7, 0.1, 0.1])
     assert favourite_move(probabilities) == "right" and cell_arrows(probabilities).count("arrow favourite") == 1

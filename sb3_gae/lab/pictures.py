@@ -77,12 +77,14 @@ def bar_chart(axes: Axes, heights: Sequence[np.ndarray], styles: Sequence[str], 
     """
     parts, width = [], 0.8 / len(heights)
     base = _y(axes, 0.0)
+    thickness = max(_x(axes, width) - _x(axes, 0.0), 0.5)
     for group, (values, style) in enumerate(zip(heights, styles, strict=True)):
-        for place, value in enumerate(values):
-            left = _x(axes, place - 0.4 + group * width)
-            top = _y(axes, float(value))
-            size = f'width="{max(_x(axes, width) - _x(axes, 0.0), 0.5):.1f}" height="{abs(base - top):.1f}"'
-            parts.append(f'<rect class="bar {style}" x="{left:.1f}" y="{min(base, top):.1f}" {size}/>')
+        # One path for all: a browser takes far longer for as many elements
+        outlines = (
+            f"M{_x(axes, place - 0.4 + group * width):.1f} {base:.1f}h{thickness:.1f}V{_y(axes, float(value)):.1f}h-{thickness:.1f}z"
+            for place, value in enumerate(values)
+        )
+        parts.append(f'<path class="bar {style}" d="{"".join(outlines)}"/>')
     for line in lines:
         points = " ".join(f"{_x(axes, x):.1f},{_y(axes, y):.1f}" for x, y in zip(line.xs, line.ys, strict=True))
         parts.append(f'<polyline class="line {line.style}" points="{points}"/>')

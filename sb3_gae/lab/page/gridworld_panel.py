@@ -12,6 +12,7 @@ from sb3_gae.lab.export import recorded_run
 from sb3_gae.lab.moment import Moment
 from sb3_gae.lab.page.charts import bias_chart, return_chart, trace_chart, trace_table, variance_chart
 from sb3_gae.lab.page.grid_panel import GridPanel, cell_name
+from sb3_gae.lab.page.pace import Pace, until_shown
 from sb3_gae.lab.page.widgets import Knob, choice, panel, picture, put
 from sb3_gae.lab.presets import PRESETS, load_preset
 from sb3_gae.lab.readings import STALL_STEPS, light
@@ -20,8 +21,6 @@ LIGHTS = {"unbiased": "●", "slight": "▲", "biased": "■"}
 LIGHT_NAMES = {"unbiased": "unbiased", "slight": "slightly biased", "biased": "biased"}
 ORDER_NAMES = {"policy_first": "policy step first (as in the paper)", "value_first": "value fit first"}
 FASTEST, MAX_RUN = 20, 2_000
-# Seconds without an answer after which nobody seems to be looking
-_LONGEST_WAIT = 20.0
 
 
 class GridworldPanel:
@@ -32,6 +31,7 @@ class GridworldPanel:
         self.simulation = load_preset(self._preset)
         self._episode = self._start = 0
         self._timer = ui.timer(0.2, self._tick, active=False)
+        self._pace = Pace(self.refresh, self._settle)
         self._build_presets()
         self._build_run()
         with ui.element("div").classes("columns three"):
@@ -52,6 +52,8 @@ class GridworldPanel:
 
     def refresh(self) -> None:
         """Show the simulation as it is."""
+        for name, knob in self._knobs.items():
+            knob.show(getattr(self.simulation.controls, name))
         self._refresh_readings()
         self._grid.refresh()
         readings = self.simulation.readings
@@ -113,7 +115,7 @@ class GridworldPanel:
                     ("learning_rate", "learning rate", 0.5, 20.0, 0.5),
                 )
             }
-            Knob("speed, steps per second", 1, FASTEST, 1, 5, self._set_speed, "speed")
+            self._speed_knob = Knob("speed, steps per second", 1, FASTEST, 1, 5, self._set_speed, "speed")
             kinds = {name: name for name in VALUE_FUNCTIONS}
             self._kind = choice("value function", kinds, "exact", self._turner("value_function"), "value_function")
             self._order = choice("order", ORDER_NAMES, "policy_first", self._turner("order"), "order")
@@ -155,6 +157,8 @@ class GridworldPanel:
         shown = trace(self._moment(), self._episode, self._start)
         self._episode_knob.set_high(self.simulation.controls.batch_size)
         self._start_knob.set_high(len(shown.deltas) - 1)
+        self._episode_knob.show(shown.episode + 1)
+        self._start_knob.show(shown.start)
         self._trace.content = trace_chart(shown)
         self._sum.content = trace_table(shown, cell_name(int(shown.states[shown.start])))
 
@@ -165,7 +169,7 @@ class GridworldPanel:
             except (TypeError, ValueError) as error:
                 ui.notify(str(error), type="negative")
                 return
-            self.refresh()
+            self._pace.ask()
 
         return turn
 
@@ -182,16 +186,19 @@ class GridworldPanel:
     def _show_controls(self) -> None:
         # What they report back are the values that the simulation has already
         controls = self.simulation.controls
-        for name, knob in self._knobs.items():
-            knob.set(getattr(controls, name))
         self._kind.value, self._order.value = controls.value_function, controls.order
         self.refresh()
+        self._settle()
+
+    def _settle(self) -> None:
+        for knob in (*self._knobs.values(), self._speed_knob, self._episode_knob, self._start_knob):
+            knob.settle()
 
     async def _tick(self) -> None:
         self._advance()
         # A browser that is slower than the speed asked for would fall behind without end; the next step waits for it
         try:
-            await ui.run_javascript("return true", timeout=_LONGEST_WAIT)
+            await until_shown()
         except TimeoutError:
             self._pause()
 
@@ -220,19 +227,18 @@ class GridworldPanel:
         self._play.text = "Play"
         self._play.props["icon"] = "play_arrow"
 
-    def _set_speed(self, value: Any) -> None:
-        if isinstance(value, int | float) and 1 <= value <= FASTEST:
-            self._timer.interval = 1.0 / value
+    def _set_speed(self, value: float) -> None:
+        self._timer.interval = 1.0 / value
+        self._speed_knob.show(value)
+        self._speed_knob.settle()
 
-    def _choose_episode(self, value: Any) -> None:
-        if isinstance(value, int | float) and value >= 1:
-            self._episode = int(value) - 1
-            self._refresh_estimator()
+    def _choose_episode(self, value: float) -> None:
+        self._episode = int(value) - 1
+        self._pace.ask()
 
-    def _choose_start(self, value: Any) -> None:
-        if isinstance(value, int | float) and value >= 0:
-            self._start = int(value)
-            self._refresh_estimator()
+    def _choose_start(self, value: float) -> None:
+        self._start = int(value)
+        self._pace.ask()
 
     def _export(self) -> None:
         title = PRESETS[self._preset].title

@@ -1,10 +1,9 @@
 """The robot's part of the page: one recorded rollout, γ and λ."""
 
-from typing import Any
-
 import numpy as np
 from nicegui import events, ui
 
+from sb3_gae.lab.page.pace import Pace
 from sb3_gae.lab.page.widgets import Knob, panel, picture
 from sb3_gae.lab.pictures import Axes, Line, bar_chart, line_chart, round_up
 from sb3_gae.lab.rollout_view import RolloutViewer, View
@@ -27,6 +26,7 @@ class RolloutPanel:
                 self._build_advantages()
             with ui.element("div").classes("stack"):
                 self._build_statistics()
+        self._pace = Pace(self.refresh, self._settle)
         self.refresh()
 
     def refresh(self) -> None:
@@ -38,6 +38,9 @@ class RolloutPanel:
             f"collected with γ = {rollout.gamma:g} and λ = {rollout.gae_lambda:g}"
         )
         self._trajectory_knob.set_high(self._viewer.n_trajectories)
+        self._trajectory_knob.show(self._trajectory + 1)
+        self._gamma_knob.show(self._gamma)
+        self._lambda_knob.show(self._gae_lambda)
         self._advantages.content = advantage_chart(view, self._viewer.steps(self._trajectory))
         self._trade_off.content = trade_off_chart(view)
         self._response.content = response_chart(*self._viewer.response(self._gamma), self._gamma * self._gae_lambda)
@@ -82,20 +85,21 @@ class RolloutPanel:
             ).classes("faint")
             self._response = picture("response")
 
-    def _turn_lambda(self, value: Any) -> None:
-        if isinstance(value, int | float) and 0.0 <= value <= 1.0:
-            self._gae_lambda = float(value)
-            self.refresh()
+    def _settle(self) -> None:
+        for knob in (self._trajectory_knob, self._gamma_knob, self._lambda_knob):
+            knob.settle()
 
-    def _turn_gamma(self, value: Any) -> None:
-        if isinstance(value, int | float) and 0.0 <= value <= 1.0:
-            self._gamma = float(value)
-            self.refresh()
+    def _turn_lambda(self, value: float) -> None:
+        self._gae_lambda = float(value)
+        self._pace.ask()
 
-    def _choose(self, value: Any) -> None:
-        if isinstance(value, int | float) and 1 <= value <= self._viewer.n_trajectories:
-            self._trajectory = int(value) - 1
-            self.refresh()
+    def _turn_gamma(self, value: float) -> None:
+        self._gamma = float(value)
+        self._pace.ask()
+
+    def _choose(self, value: float) -> None:
+        self._trajectory = int(value) - 1
+        self._pace.ask()
 
     async def _load(self, event: events.UploadEventArguments) -> None:
         try:
@@ -111,13 +115,8 @@ class RolloutPanel:
         self._complaint.text = ""
         self._viewer, self._trajectory = viewer, 0
         self._gamma, self._gae_lambda = viewer.rollout.gamma, viewer.rollout.gae_lambda
-        for knob, value in (
-            (self._trajectory_knob, 1),
-            (self._gamma_knob, self._gamma),
-            (self._lambda_knob, self._gae_lambda),
-        ):
-            knob.set(value)
         self.refresh()
+        self._settle()
 
 
 def advantage_chart(view: View, steps: tuple[np.ndarray, np.ndarray]) -> str:
