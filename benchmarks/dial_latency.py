@@ -35,12 +35,15 @@ DIALS = (
 )
 #: steps of the run before the gridworld's dials are turned, so that its curves have something in them
 RUN = 40
+#: presses in the same direction; no dial has fewer steps
+ONE_WAY = 30
 PATIENCE = 60
 
 WATCH = """
 const [marker, picture] = arguments;
 const find = name => document.querySelector(`[data-test="${name}"]`);
-const slider = find(marker), thumb = slider.querySelector(".q-slider__thumb"), number = find(marker + "-shown"), pictures = find(picture);
+const slider = find(marker), thumb = slider.querySelector(".q-slider__thumb");
+const number = find(marker + "-shown"), pictures = find(picture);
 window.unwatch?.();
 const inputs = [], waits = [];
 let event = null, answered = 0, pending = null;
@@ -56,8 +59,9 @@ const moved = new MutationObserver(() => {
 moved.observe(thumb, { attributes: true, attributeFilter: ["style"] });
 const shown = new MutationObserver(records => {
   if (records.some(each => number.contains(each.target))) {
-    const place = inputs.findLastIndex(each => each.value === +number.textContent);
-    if (place >= answered) pending = place + 1;
+    // The first move that it may be the answer to, as a drag comes by the same value again
+    const place = inputs.findIndex((each, place) => place >= answered && each.value === +number.textContent);
+    if (place >= 0) pending = place + 1;
   }
   if (pending === null || !records.some(each => pictures.contains(each.target))) return;
   const times = inputs.slice(answered, pending).map(each => each.time);
@@ -109,10 +113,10 @@ def report(what: str, waits: np.ndarray) -> None:
 
 
 def by_keyboard(browser: webdriver.Chrome, dial: str, picture: str, n_moves: int) -> np.ndarray:
-    """Waits of presses of the arrow keys: from the low end up, and down again from the middle on."""
+    """Waits of presses of the arrow keys, up from the low end and down again, and so on."""
     element = watched(browser, dial, picture)
     for move in range(n_moves):
-        element.send_keys(Keys.RIGHT if move < n_moves // 2 else Keys.LEFT)
+        element.send_keys(Keys.LEFT if move // ONE_WAY % 2 else Keys.RIGHT)
         until(browser, lambda move=move: answers(browser) > move)
     return waits(browser)
 
@@ -120,7 +124,9 @@ def by_keyboard(browser: webdriver.Chrome, dial: str, picture: str, n_moves: int
 def by_drag(browser: webdriver.Chrome, dial: str, picture: str, n_moves: int) -> np.ndarray:
     """Waits of the moves of one drag to and fro."""
     element = watched(browser, dial, picture)
-    box = browser.execute_script("const b = arguments[0].getBoundingClientRect(); return [b.x, b.y + b.height / 2, b.width]", element)
+    box = browser.execute_script(
+        "const b = arguments[0].getBoundingClientRect(); return [b.x, b.y + b.height / 2, b.width]", element
+    )
 
     def mouse(kind: str, place: float) -> None:
         event = {"type": kind, "x": box[0] + box[2] * place, "y": box[1], "button": "left", "buttons": 1, "clickCount": 1}

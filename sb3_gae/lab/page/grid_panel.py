@@ -84,9 +84,9 @@ class GridPanel:
                 grid.props["aria-label"] = "Gridworld of 5 rows and 5 columns"
                 self._cells = [self._cell(state) for state in range(SIZE**2)]
             ui.label(
-                "Greener cells hold more value, slate ones less than nothing; the number is what the estimator takes for V. The "
-                "longest arrow, in clay orange, is the policy's favourite move. Click a cell to read its numbers; arrow keys go "
-                "from cell to cell."
+                "Greener cells hold more value, slate ones less than nothing; the number is what the estimator takes for V. "
+                "The longest arrow, in clay orange, is the policy's favourite move. Click a cell to read its numbers; arrow "
+                "keys go from cell to cell."
             ).classes("faint q-mt-sm")
         with panel("The cell"):
             self._details = ui.html("", sanitize=False).classes("scrolls")
@@ -134,7 +134,9 @@ def cell_table(moment: Moment, state: int) -> str:
     """
     if state in ENDS:
         end = ENDS[state]
-        return f"<p>{cell_name(state).capitalize()}: the {end.name}. Entering it is worth {end.worth} and ends the episode.</p>"
+        return (
+            f"<p>{cell_name(state).capitalize()}: the {end.name}. Entering it is worth {end.worth} and ends the episode.</p>"
+        )
     policy, gamma = moment.policy, moment.controls.gamma
     advantages, actions = policy.advantages(gamma)[state], policy.action_values(gamma)[state]
     expected = moment.moments.advantage_mean[state]

@@ -20,6 +20,14 @@ from sb3_gae.lab.readings import STALL_STEPS, light
 LIGHTS = {"unbiased": "●", "slight": "▲", "biased": "■"}
 LIGHT_NAMES = {"unbiased": "unbiased", "slight": "slightly biased", "biased": "biased"}
 ORDER_NAMES = {"policy_first": "policy step first (as in the paper)", "value_first": "value fit first"}
+ABOUT = (
+    "A softmax policy on a 5 by 5 gridworld with a goal worth +1 and a trap worth −1. Each step samples a batch of episodes, "
+    "estimates the advantage at every visited step with GAE(γ, λ), the exponentially weighted sum of residuals, and takes one "
+    "policy-gradient ascent step. Bias is the angle between the estimator's expected gradient and the true gradient, both "
+    "computed exactly and on the side, only to score it: zero at λ = 1 for any value function, and growing as λ shrinks under "
+    "a wrong one. One plain ascent step on a grid that can be solved stands in for the paper's trust-region update and neural "
+    "networks. Each preset has a seed of its own, so it gives the same run every time; loading one resets it."
+)
 FASTEST, MAX_RUN = 20, 2_000
 
 
@@ -38,6 +46,7 @@ class GridworldPanel:
             with ui.element("div").classes("stack"):
                 with panel("Return, in parts of the best possible (dashed)"):
                     self._returns = picture("returns")
+                    self._hint = ui.label("").classes("faint")
                 self._grid = GridPanel(self._moment)
             with ui.element("div").classes("stack"):
                 self._build_knobs()
@@ -48,6 +57,8 @@ class GridworldPanel:
             with ui.element("div").classes("stack wide"):
                 self._build_estimator()
                 self._build_log()
+        with panel("What this is"):
+            ui.label(ABOUT)
         self.refresh()
 
     def refresh(self) -> None:
@@ -59,6 +70,7 @@ class GridworldPanel:
         readings = self.simulation.readings
         self._returns.content, self._bias.content = return_chart(readings), bias_chart(readings)
         self._variance.content = variance_chart(readings)
+        self._hint.text = "" if self.simulation.reading.step else "Run a few steps to draw the return and bias curves."
         events = [f"step {event.step}: {event.text}" for event in reversed(self.simulation.events)]
         self._log.content = "".join(f"<div>{text}</div>" for text in events) or (
             "Reach optimal or flip a control to start the log."
@@ -90,7 +102,11 @@ class GridworldPanel:
                 with ui.element("div").classes("readings") as readings:
                     readings.props["data-test"] = "readings"
                     self._step_count, self._return, self._v = ui.label(), ui.label(), ui.label()
-                    self._light, self._noise, self._status = ui.label().classes("light"), ui.label(), ui.label()
+                    self._light, self._noise, self._status = (
+                        ui.label().classes("light"),
+                        ui.label(),
+                        ui.label().classes("status"),
+                    )
             self._light.props["data-test"], self._status.props["data-test"] = "light", "status"
             self._step_count.props["data-test"] = "step-count"
 
@@ -123,7 +139,7 @@ class GridworldPanel:
     def _build_estimator(self) -> None:
         with panel("What the estimator is doing"):
             ui.label(
-                "One sampled episode of the coming step. Slate: residuals δ. Clay: the same, weighted with (γλ)^l (the curve) "
+                "One sampled episode of the coming step. Slate: residuals δ. Clay: the same, weighted with (γλ)ˡ (the curve) "
                 "and added up to the advantage of the chosen step."
             ).classes("faint")
             self._trace = picture("trace")
@@ -139,14 +155,14 @@ class GridworldPanel:
         self._return.text = f"return {reading.score:.0%} of the best"
         self._v.text = f"{controls.value_function} V"
         shown = light(reading.bias_angle)
-        self._light.text = f"{LIGHTS[shown]} bias: {LIGHT_NAMES[shown]} ({reading.bias_angle:.2f})"
+        self._light.text = f"{LIGHTS[shown]} bias: {LIGHT_NAMES[shown]} ({reading.bias_angle:.2f} rad)"
         self._light.classes(replace=f"light {shown}")
         self._noise.text = f"variance {reading.variance:.3f} (exact)"
         self._status.text = self.simulation.status
         recent = [each.share_of_gradient for each in self.simulation.readings[-STALL_STEPS:]]
         self._share.text = (
             f"The gradients of the last {len(recent)} batches have {np.mean(recent):.0%} of the true one (sampled). "
-            "Unbiased estimates have 100 % on average."
+            "Unbiased estimates have 100% on average."
         )
         self._story.text = PRESETS[self._preset].story
         for name, button in self._preset_buttons.items():

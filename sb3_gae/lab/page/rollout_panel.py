@@ -5,7 +5,7 @@ from nicegui import events, ui
 
 from sb3_gae.lab.page.pace import Pace
 from sb3_gae.lab.page.widgets import Knob, panel, picture
-from sb3_gae.lab.pictures import Axes, Line, bar_chart, line_chart, round_up
+from sb3_gae.lab.pictures import Axes, Band, Line, bar_chart, line_chart, round_up
 from sb3_gae.lab.rollout_view import RolloutViewer, View
 from sb3_gae.rollout_file import MAX_BYTES, load_rollout
 
@@ -44,12 +44,7 @@ class RolloutPanel:
         self._advantages.content = advantage_chart(view, self._viewer.steps(self._trajectory))
         self._trade_off.content = trade_off_chart(view)
         self._response.content = response_chart(*self._viewer.response(self._gamma), self._gamma * self._gae_lambda)
-        bias, variance = view.bias_squared, view.variance
-        self._summary.text = (
-            f"At λ = {self._gae_lambda:g}: bias² {bias.value[-1]:.3f} ± {bias.standard_error[-1]:.3f}, "
-            f"variance {variance.value[-1]:.3f} ± {variance.standard_error[-1]:.3f} of what it is at λ = 1 (estimated from "
-            "this rollout alone)"
-        )
+        self._summary.text = summary(view)
 
     def _build_controls(self) -> None:
         with panel("The rollout"), ui.element("div").classes("stack"):
@@ -74,14 +69,19 @@ class RolloutPanel:
             self._advantages = picture("advantages")
 
     def _build_statistics(self) -> None:
-        with panel("Bias² (solid) and variance (dashed) of the batch's policy gradient for each λ"):
+        with panel("Bias and variance of the batch's policy gradient for each λ"):
+            ui.label(
+                "Clay, solid: bias², with a band of one standard error to either side. Slate, dashed: variance. Both in units "
+                "of the variance at λ = 1. Dotted: the dial."
+            ).classes("faint")
             self._trade_off = picture("trade-off")
-            self._summary = ui.label("").classes("faint")
+            self._summary = ui.label("")
             self._summary.props["data-test"] = "rollout-summary"
         with panel("Response of the policy gradient by delay"):
             ui.label(
                 "‖E[∇log π · x at l steps later]‖²: what remains of the response function χ(l) where states do not recur. "
-                "Slate: rewards. Clay: residuals, which V has shaped. Curve: the weights (γλ)^l. Each in units of its largest."
+                "Slate: rewards. Clay: residuals, which V has shaped. Curve: the weights (γλ)ˡ. Each in units of its largest; "
+                "bars below zero are noise of the estimate."
             ).classes("faint")
             self._response = picture("response")
 
@@ -132,6 +132,26 @@ def advantage_chart(view: View, steps: tuple[np.ndarray, np.ndarray]) -> str:
     return bar_chart(axes, [curves[2]], ["delta"], lines)
 
 
+def summary(view: View) -> str:
+    """
+    :param view: of the rollout
+    :return: bias and variance at the chosen λ, and whether there is any bias to be seen
+    """
+    gae_lambda = view.lambdas[-1]
+    (bias, bias_error), (variance, variance_error) = (
+        (each.value[-1], each.standard_error[-1]) for each in (view.bias_squared, view.variance)
+    )
+    verdict = "more than two standard errors above zero"
+    if gae_lambda == 1.0:
+        verdict = "zero by definition, as λ = 1 is what the others are compared with"
+    elif not bias > 2.0 * bias_error:
+        verdict = "cannot be told from zero with this rollout"
+    return (
+        f"At λ = {gae_lambda:g}: bias² {bias:.3f} ± {bias_error:.3f}, {verdict}; "
+        f"variance {variance:.3f} ± {variance_error:.3f}. Estimated from this rollout alone, with one standard error each."
+    )
+
+
 def trade_off_chart(view: View) -> str:
     """
     :param view: of the rollout
@@ -140,12 +160,15 @@ def trade_off_chart(view: View) -> str:
     order = np.argsort(view.lambdas, kind="stable")
     # λ between 0.9 and 1 is where things happen: places by the logarithm of the horizon
     places = -np.log(1.0 - 0.99 * view.lambdas) / np.log(100.0)
-    axes = Axes(
-        "Bias squared and variance for each λ", (0.0, 1.0), (0.0, 1.0), x_label="λ from 0 to 1, places by log of the horizon"
-    )
-    bias = Line(places[order], np.maximum(view.bias_squared.value[order], 0.0), "bias")
+    value, error = (array[order] for array in view.bias_squared)
+    label = "Bias squared and variance for each λ"
+    top = round_up(max(1.0, float(value.max())))
+    axes = Axes(label, (0.0, 1.0), (0.0, top), x_label="λ from 0 to 1, places by log of the horizon")
+    bias = Line(places[order], value, "bias")
     variance = Line(places[order], view.variance.value[order], "variance")
-    return line_chart(axes, [bias, variance], marks=[float(places[-1])])
+    error = np.nan_to_num(error)
+    band = Band(places[order], value - error, value + error, "bias")
+    return line_chart(axes, [bias, variance], [float(places[-1])], [band])
 
 
 def response_chart(rewards: np.ndarray, shaped: np.ndarray, decay: float) -> str:

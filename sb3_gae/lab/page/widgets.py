@@ -32,7 +32,9 @@ class Knob:
                 self._shown = ui.label(f"{value:g}")
                 self._shown.props["data-test"] = f"{marker}-shown"
             # Not ui.slider, which sends a drag on every 50 milliseconds only
-            self._slider = ui.element("q-slider").on("update:model-value", lambda event: self._turn(event.args), throttle=_THROTTLE)
+            self._slider = ui.element("q-slider").on(
+                "update:model-value", lambda event: self._turn(event.args), throttle=_THROTTLE
+            )
             self._slider.props.update({"min": low, "max": high, "step": step, "model-value": value})
             self._slider.props.update({"aria-label": name, "data-test": marker})
         # Quasar's slider knows the arrows and page keys only
