@@ -246,7 +246,7 @@ class GridworldPanel:
     def _set_speed(self, value: float) -> None:
         self._timer.interval = 1.0 / value
         self._speed_knob.show(value)
-        self._speed_knob.settle()
+        self._pace.ask()
 
     def _choose_episode(self, value: float) -> None:
         self._episode = int(value) - 1
