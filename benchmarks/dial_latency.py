@@ -30,8 +30,8 @@ from selenium.webdriver.support.ui import WebDriverWait
 DIALS = (
     ("grid", "gae_lambda", "trace"),
     ("grid", "gamma", "trace"),
-    ("robot", "rollout_lambda", "advantages"),
-    ("robot", "rollout_gamma", "advantages"),
+    ("robot", "rollout_lambda", "trade-off"),
+    ("robot", "rollout_gamma", "response"),
 )
 #: steps of the run before the gridworld's dials are turned, so that its curves have something in them
 RUN = 40

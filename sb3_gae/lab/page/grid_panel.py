@@ -28,6 +28,8 @@ class End(NamedTuple):
     value: float
 
 
+#: percent of a cell's colour; more, and its arrows and text would not stand out
+DEEPEST = 35.0
 #: by state
 ENDS = {4: End("goal", "★", "+1", 1.0), 12: End("trap", "✕", "−1", -1.0)}
 
@@ -46,7 +48,7 @@ def cell_style(value: float) -> str:
     :param value: of a cell
     :return: green for more, slate for less than nothing; the stronger the further from it
     """
-    amount = min(abs(value), 1.0) * 75.0
+    amount = min(abs(value), 1.0) * DEEPEST
     return f"--amount: {amount:.0f}%; --tint: var({'--good' if value >= 0.0 else '--bad'})"
 
 
