@@ -65,7 +65,8 @@ class RolloutPanel:
 
     def _build_advantages(self) -> None:
         with panel("Advantages along the trajectory"):
-            ui.label("Line: with the λ of the dial. Dashed: with λ = 1. Bars: residuals δ. In units of the reward.").classes("faint")
+            explanation = "Line: with the λ of the dial. Dashed: with λ = 1. Bars: residuals δ. In units of the reward."
+            ui.label(explanation).classes("faint")
             self._advantages = picture("advantages")
 
     def _build_statistics(self) -> None:
