@@ -225,6 +225,8 @@ class GridworldPanel:
             return
         self.simulation.step()
         self.refresh()
+        # The next episode may be shorter than the step that was chosen
+        self._start_knob.settle()
 
     def _step_once(self) -> None:
         self._pause()
