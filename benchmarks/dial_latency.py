@@ -3,7 +3,7 @@ How long the page of the λ dial takes to answer: from an input event to the fra
 
     python benchmarks/dial_latency.py                 # needs the extra `lab`, selenium, chromium and chromedriver
 
-Every dial is moved by single presses of an arrow key, each after the answer to the one before, and by one drag with a move
+Every dial is moved by single presses of an arrow key, each after the answer to the one before, and by drags with a move
 every 16 milliseconds. All is measured by the page itself, with the times that the browser gives its events. A move whose value
 is never shown, as a later one has overtaken it, is answered by the first that is.
 """
@@ -59,9 +59,8 @@ const moved = new MutationObserver(() => {
 moved.observe(thumb, { attributes: true, attributeFilter: ["style"] });
 const shown = new MutationObserver(records => {
   if (records.some(each => number.contains(each.target))) {
-    // The first move that it may be the answer to, as a drag comes by the same value again
-    const place = inputs.findIndex((each, place) => place >= answered && each.value === +number.textContent);
-    if (place >= 0) pending = place + 1;
+    const place = inputs.findLastIndex(each => each.value === +number.textContent);
+    if (place >= answered) pending = place + 1;
   }
   if (pending === null || !records.some(each => pictures.contains(each.target))) return;
   const times = inputs.slice(answered, pending).map(each => each.time);
@@ -122,17 +121,21 @@ def by_keyboard(browser: webdriver.Chrome, dial: str, picture: str, n_moves: int
 
 
 def by_drag(browser: webdriver.Chrome, dial: str, picture: str, n_moves: int) -> np.ndarray:
-    """Waits of the moves of one drag to and fro."""
+    """Waits of the moves of two drags, one up and one down. In neither does a value come twice: an answer is known by it."""
+    places = np.linspace(0.02, 0.98, (n_moves + 1) // 2)
+    return np.concatenate([one_drag(browser, dial, picture, each) for each in (places, places[::-1])])
+
+
+def one_drag(browser: webdriver.Chrome, dial: str, picture: str, places: np.ndarray) -> np.ndarray:
+    """Waits of the moves of a drag through places that are parts of the dial's width."""
     element = watched(browser, dial, picture)
-    box = browser.execute_script(
-        "const b = arguments[0].getBoundingClientRect(); return [b.x, b.y + b.height / 2, b.width]", element
-    )
+    script = "const b = arguments[0].getBoundingClientRect(); return [b.x, b.y + b.height / 2, b.width]"
+    box = browser.execute_script(script, element)
 
     def mouse(kind: str, place: float) -> None:
         event = {"type": kind, "x": box[0] + box[2] * place, "y": box[1], "button": "left", "buttons": 1, "clickCount": 1}
         browser.execute_cdp_cmd("Input.dispatchMouseEvent", event)
 
-    places = 0.5 + 0.45 * np.sin(np.linspace(0.0, 2.0 * np.pi, n_moves))
     mouse("mousePressed", places[0])
     for place in places:
         start = time.monotonic()
