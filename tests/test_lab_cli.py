@@ -61,7 +61,8 @@ def test_pictures_hold_what_they_are_given() -> None:
     axes = Axes("a label", (0.0, 10.0), (0.0, 1.0))
     picture = line_chart(axes, [Line(np.arange(1000) / 100, np.append(np.full(999, 0.5), np.nan), "return")], marks=[3.0])
     assert 'aria-label="a label"' in picture and picture.count("<polyline") == 1 and "nan" not in picture
-    assert bar_chart(Axes("b", (-0.5, 2.5), (-1.0, 1.0)), [np.array([1.0, -1.0, 0.0])], ["delta"]).count("<rect") == 3
+    bars = bar_chart(Axes("b", (-0.5, 2.5), (-1.0, 1.0)), [np.array([1.0, -1.0, 0.0])], ["delta"])
+    assert bars.count('<path class="bar delta"') == 1 and bars.count("M") == 3
     assert [round_up(value) for value in (0.0, 0.03, 1.0, 7.0, np.inf)] == pytest.approx([1.0, 0.05, 1.0, 10.0, 1.0])
     probabilities = np.array([0.1, 0.7, 0.1, 0.1])
     assert favourite_move(probabilities) == "right" and cell_arrows(probabilities).count("arrow favourite") == 1
@@ -82,8 +83,16 @@ THEMES = {
 }
 
 
-def luminance(colour: str) -> float:
-    channels = np.array([int(colour[place : place + 2], 16) / 255 for place in (1, 3, 5)])
+def channels(colour: str) -> np.ndarray:
+    return np.array([int(colour[place : place + 2], 16) / 255 for place in (1, 3, 5)])
+
+
+def contrast(ink: np.ndarray, paper: np.ndarray) -> float:
+    dark, bright = sorted((luminance(ink), luminance(paper)))
+    return (bright + 0.05) / (dark + 0.05)
+
+
+def luminance(channels: np.ndarray) -> float:
     linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
@@ -93,5 +102,15 @@ def test_text_stands_out_from_what_is_behind_it(theme: str) -> None:
     colours = THEMES[theme]
     for ink in ("ink", "faint", "red", "amber", "green", "clay"):
         for paper in ("surface", "page") if ink != "clay" else ("surface",):
-            dark, bright = sorted(luminance(colours[name]) for name in (ink, paper))
-            assert (bright + 0.05) / (dark + 0.05) >= 4.5, (ink, paper)
+            assert contrast(channels(colours[ink]), channels(colours[paper])) >= 4.5, (ink, paper)
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("tint", ["good", "bad"])
+def test_cells_of_the_deepest_colour_can_be_read(theme: str, tint: str) -> None:
+    deepest = pytest.importorskip("sb3_gae.lab.page.grid_panel", reason="the extra `lab` is needed").DEEPEST / 100
+    colours = {name: channels(colour) for name, colour in THEMES[theme].items()}
+    paper = deepest * colours[tint] + (1.0 - deepest) * colours["surface"]
+    assert contrast(colours["ink"], paper) >= 4.5
+    # Arrows are pictures, not text
+    assert contrast(colours["clay"], paper) >= 3.0

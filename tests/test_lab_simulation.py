@@ -142,8 +142,25 @@ def test_controls_change_a_run_and_are_logged_once_for_a_drag() -> None:
         simulation.change(gae_lambda=gae_lambda)
     simulation.change(gae_lambda=1.0)
     texts = [event.text for event in simulation.events]
-    assert texts[1:] == ["λ: 0 → 1", "bias went off (0.00 rad)"] or texts[1:] == ["bias went off (0.00 rad)", "λ: 0 → 1"]
+    assert texts[1] == "λ: 0 → 1" and texts[-1] == "bias went off (0.00 rad)"
+    assert len([text for text in texts if "→" in text]) == 1
     assert len(simulation.readings) == 2
+
+
+def test_each_change_of_the_light_is_logged() -> None:
+    simulation = Simulation(Controls(1.0, value_function="zero"))
+    shown, angles = [], []
+    for gae_lambda in (0.9, 0.0, 0.9, 1.0, 0.0, 1.0):
+        simulation.change(gae_lambda=gae_lambda)
+        shown.append(light(simulation.reading.bias_angle))
+        angles.append(f"{simulation.reading.bias_angle:.2f} rad")
+    assert shown == ["slight", "biased", "slight", "unbiased", "biased", "unbiased"]
+    words = [
+        "a slight bias came on", "the bias is no longer slight", "the bias became slight", "bias went off", "bias came on",
+        "bias went off",
+    ]  # fmt: skip
+    logged = [event.text for event in simulation.events if "→" not in event.text]
+    assert logged == [f"{word} ({angle})" for word, angle in zip(words, angles, strict=True)]
 
 
 def test_a_turn_of_the_dial_takes_a_few_milliseconds() -> None:

@@ -24,6 +24,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--port", type=int, default=DEFAULT_PORT, help="port to listen at (default: %(default)s, 0 for a free one)"
     )
     parser.add_argument("--no-browser", action="store_true", help="only serve the page, open nothing")
+    parser.add_argument(
+        "--allow-host", action="append", default=[], metavar="NAME",
+        help="name in the address line that the page answers to, besides localhost and, if others can reach it, its addresses "
+        "and this machine's name; may be given several times",
+    )  # fmt: skip
     parser.add_argument("--rollout", type=Path, default=SHIPPED_ROLLOUT, help="rollout saved by SaveRolloutCallback")
     options = parser.parse_args(arguments)
     if importlib.util.find_spec("nicegui") is None:
@@ -46,9 +51,12 @@ def _run(listening: socket.socket, viewer: RolloutViewer, options: argparse.Name
 
     host, port = listening.getsockname()[:2]
     address = f"http://{f'[{host}]' if ':' in host else host}:{port}/"
-    who = "only this machine can reach it" if _is_local(host) else "others on the network may reach it"
+    who = "only this machine can reach it"
+    if not _is_local(host):
+        names = ", ".join([socket.gethostname(), *options.allow_host])
+        who = f"others on the network may reach it, by any of its addresses or as {names}"
     print(f"The λ dial is at {address}; {who}. Ctrl-C ends it.", flush=True)
-    serve(listening, viewer, None if options.no_browser else address)
+    serve(listening, viewer, None if options.no_browser else address, options.allow_host)
     return 0
 
 

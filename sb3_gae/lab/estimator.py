@@ -18,6 +18,7 @@ class Trace(NamedTuple):
     :param deltas: :math:`\delta`, shape (T,)
     :param advantages: :math:`\hat A` of every step, shape (T,)
     :param true_advantages: :math:`A^{\pi,\gamma}` of every step, shape (T,)
+    :param episode: its place in the batch
     :param start: the step t that the weights belong to
     :param weights: :math:`(\gamma\lambda)^l` of the residuals from step t on, shape (T - t,)
     """
@@ -28,6 +29,7 @@ class Trace(NamedTuple):
     deltas: np.ndarray
     advantages: np.ndarray
     true_advantages: np.ndarray
+    episode: int
     start: int
     weights: np.ndarray
 
@@ -52,6 +54,7 @@ def trace(moment: Moment, episode: int = 0, start: int = 0) -> Trace:
         deltas=deltas[steps, episode],
         advantages=moment.advantages[steps, episode],
         true_advantages=moment.policy.advantages(controls.gamma)[states, actions],
+        episode=episode,
         start=start,
         weights=(controls.gamma * controls.gae_lambda) ** np.arange(len(steps) - start),
     )

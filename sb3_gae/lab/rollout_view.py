@@ -51,6 +51,7 @@ class RolloutViewer:
         self.rollout = rollout
         self.groups = trajectory_groups(rollout.dones, N_GROUPS, rollout.mask)
         self.trajectories = trajectory_indices(rollout.dones, rollout.mask)
+        self._kept: tuple[float, np.ndarray] | None = None
 
     @property
     def n_trajectories(self) -> int:
@@ -96,10 +97,16 @@ class RolloutViewer:
         :raises ValueError: if ``gamma`` is out of range
         """
         check_number("gamma", gamma, 0.0, 1.0)
-        rollout = self.rollout
-        deltas = td_residuals(rollout.rewards, rollout.values, rollout.next_values, gamma)
-        shaped = self._lagged_norms(deltas)
+        shaped = self._shaped_response(gamma)
         return self._reward_response / self._reward_response.max(), shaped / max(float(shaped.max()), 1e-300)
+
+    def _shaped_response(self, gamma: float) -> np.ndarray:
+        # λ is turned more often than γ, and plays no part
+        if self._kept is None or self._kept[0] != gamma:
+            rollout = self.rollout
+            deltas = td_residuals(rollout.rewards, rollout.values, rollout.next_values, gamma)
+            self._kept = gamma, self._lagged_norms(deltas)
+        return self._kept[1]
 
     @cached_property
     def _group_sizes(self) -> np.ndarray:

@@ -42,6 +42,17 @@ CONTROL_NAMES = {
 }
 
 
+#: what the log says, by the light before and now
+LIGHT_CHANGES = {
+    ("unbiased", "slight"): "a slight bias came on",
+    ("unbiased", "biased"): "bias came on",
+    ("slight", "biased"): "the bias is no longer slight",
+    ("biased", "slight"): "the bias became slight",
+    ("slight", "unbiased"): "bias went off",
+    ("biased", "unbiased"): "bias went off",
+}
+
+
 class Simulation:
     """
     :param controls: to begin with
@@ -116,12 +127,11 @@ class Simulation:
         return Frame(self.moment.values, self.moment.policy.probabilities)
 
     def _note_light(self) -> None:
-        """Log that the light turned red or green; a slight bias in between is no event."""
+        """Log that the light changed its colour."""
         shown = light(self.reading.bias_angle)
-        if shown in ("slight", self._light):
-            return
-        self._log(f"bias {'came on' if shown == 'biased' else 'went off'} ({self.reading.bias_angle:.2f} rad)")
-        self._light = shown
+        if shown != self._light:
+            self._log(f"{LIGHT_CHANGES[self._light, shown]} ({self.reading.bias_angle:.2f} rad)")
+            self._light = shown
 
     def _note_status(self) -> None:
         words = {"optimal": "optimal reached", "stalled": "the climb stalled", "climbing": "climbing again"}
@@ -131,13 +141,21 @@ class Simulation:
 
     def _log_turn(self, name: str, before: Any, after: Any) -> None:
         """Log a turned control; a drag, which turns the same one many times at one step, as one event."""
-        start = f"{name}: "
-        if self.events and self.events[-1].step == self.moment.step and self.events[-1].text.startswith(start):
-            before = self.events.pop().text.removeprefix(start).split(" → ")[0]
+        start, place = f"{name}: ", self._turned_last()
+        if place is not None and self.events[place].text.startswith(start):
+            before = self.events.pop(place).text.removeprefix(start).split(" → ")[0]
+        else:
+            place = len(self.events)
         before = before if isinstance(before, str) else f"{before:g}"
         after = after if isinstance(after, str) else f"{after:g}"
         if before != after:
-            self._log(f"{start}{before.replace('_', ' ')} → {after.replace('_', ' ')}")
+            text = f"{start}{before.replace('_', ' ')} → {after.replace('_', ' ')}"
+            self.events.insert(place, Event(self.moment.step, text))
+
+    def _turned_last(self) -> int | None:
+        """Place in the log of the control that was turned last at this step; the light may have changed meanwhile."""
+        turns = [place for place, event in enumerate(self.events) if " → " in event.text and event.step == self.moment.step]
+        return turns[-1] if turns else None
 
     def _log(self, text: str) -> None:
         self.events.append(Event(self.moment.step, text))

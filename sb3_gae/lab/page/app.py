@@ -3,6 +3,7 @@
 import socket
 import warnings
 import webbrowser
+from collections.abc import Sequence
 from pathlib import Path
 
 import uvicorn
@@ -11,6 +12,7 @@ from nicegui import app as nicegui_app
 from nicegui import ui
 
 from sb3_gae.lab.page.gridworld_panel import GridworldPanel
+from sb3_gae.lab.page.host_guard import HostGuard
 from sb3_gae.lab.page.rollout_panel import RolloutPanel
 from sb3_gae.lab.page.widgets import heading
 from sb3_gae.lab.rollout_view import RolloutViewer
@@ -18,32 +20,17 @@ from sb3_gae.lab.rollout_view import RolloutViewer
 TITLE = "The λ dial"
 _STYLE = (Path(__file__).parent.parent / "style.css").read_text(encoding="utf-8")
 
-# Quasar gives the role of a slider to an element that the keyboard never gets to; what does get the focus should speak
-_SPEAKING_SLIDERS = """<script>
-const spoken = ["aria-label", "aria-valuemin", "aria-valuemax", "aria-valuenow", "aria-orientation"];
-function say(element, name, text) {
-  // Only what is new: the observer sees this, too
-  if (text !== null && element.getAttribute(name) !== text) element.setAttribute(name, text);
-}
-function speak() {
-  for (const slider of document.querySelectorAll(".q-slider")) {
-    const focused = slider.querySelector(".q-slider__track-container");
-    say(focused, "role", "slider");
-    for (const name of spoken) say(focused, name, slider.getAttribute(name));
-    say(slider, "role", "presentation");
-  }
-}
-new MutationObserver(speak).observe(document, { subtree: true, childList: true, attributeFilter: ["role", ...spoken] });
-</script>"""
+_KEYBOARD = (Path(__file__).parent / "keyboard.js").read_text(encoding="utf-8")
 
 
-def serve(listening: socket.socket, viewer: RolloutViewer, show: str | None = None) -> None:
+def serve(listening: socket.socket, viewer: RolloutViewer, show: str | None = None, names: Sequence[str] = ()) -> None:
     """
     Serve the page until interrupted.
 
     :param listening: bound to where the page is to be
     :param viewer: of the rollout that the page begins with
     :param show: address to open in a browser, None for no browser
+    :param names: of hosts to answer to, see :class:`~sb3_gae.lab.page.host_guard.HostGuard`
     """
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
 
@@ -56,7 +43,11 @@ def serve(listening: socket.socket, viewer: RolloutViewer, show: str | None = No
     ui.run_with(app, root=page, show_welcome_message=False, reconnect_timeout=30.0, **looks)  # type: ignore[arg-type]
     if show is not None:
         nicegui_app.on_startup(lambda: webbrowser.open(show))
-    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", timeout_graceful_shutdown=2))
+    guarded = HostGuard(app, listening.getsockname()[0], names)
+    # Between two processes of one machine, and in most networks, to compress takes longer than to send
+    server = uvicorn.Server(
+        uvicorn.Config(guarded, log_level="warning", timeout_graceful_shutdown=2, ws_per_message_deflate=False)
+    )
     # NiceGUI looks through all objects of the process, and some of torch warn when they are looked at
     with warnings.catch_warnings(action="ignore", category=FutureWarning):
         server.run(sockets=[listening])
@@ -67,7 +58,7 @@ def build_page(viewer: RolloutViewer) -> None:
     :param viewer: of the rollout to begin with
     """
     ui.add_css(_STYLE)
-    ui.add_head_html(_SPEAKING_SLIDERS)
+    ui.add_head_html(f"<script>{{{_KEYBOARD}}}</script>")
     theme = ui.dark_mode(None)
     with ui.element("main").classes("lab") as main:
         with ui.element("div").classes("beside q-mb-sm").style("justify-content: space-between"):

@@ -8,7 +8,7 @@ from sb3_gae.lab.pictures import Axes, Line, bar_chart, line_chart, round_up
 from sb3_gae.lab.readings import Reading
 
 #: rows of the table of an episode
-MAX_ROWS = 40
+MAX_ROWS = 16
 
 
 def return_chart(readings: list[Reading]) -> str:

@@ -1,6 +1,7 @@
 """The grid as 25 buttons, and what the one that was clicked says."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from nicegui import ui
@@ -11,7 +12,26 @@ from sb3_gae.lab.page.widgets import panel, put
 from sb3_gae.lab.pictures import cell_arrows, favourite_move
 
 SIZE = 5
-GOAL, TRAP = 4, 12
+
+
+class End(NamedTuple):
+    """
+    :param name: of a cell where episodes end
+    :param sign: that tells it without colour
+    :param worth: as it is shown
+    :param value: of entering it
+    """
+
+    name: str
+    sign: str
+    worth: str
+    value: float
+
+
+#: percent of a cell's colour; more, and its arrows and text would not stand out
+DEEPEST = 35.0
+#: by state
+ENDS = {4: End("goal", "★", "+1", 1.0), 12: End("trap", "✕", "−1", -1.0)}
 
 
 def cell_name(state: int) -> str:
@@ -28,8 +48,28 @@ def cell_style(value: float) -> str:
     :param value: of a cell
     :return: green for more, slate for less than nothing; the stronger the further from it
     """
-    amount = min(abs(value), 1.0) * 75.0
+    amount = min(abs(value), 1.0) * DEEPEST
     return f"--amount: {amount:.0f}%; --tint: var({'--good' if value >= 0.0 else '--bad'})"
+
+
+def cell_classes(state: int, is_chosen: bool) -> str:
+    """
+    :param state: of the gridworld
+    :param is_chosen: whether its numbers are shown
+    :return: CSS classes
+    """
+    return f"cell{f' {ENDS[state].name}' if state in ENDS else ''}{' chosen' if is_chosen else ''}"
+
+
+def cell_content(state: int, value: float, probabilities: np.ndarray) -> str:
+    """
+    :param state: of the gridworld, no end
+    :param value: of the cell
+    :param probabilities: of the moves in it, shape (4,)
+    :return: what is in the cell, as HTML
+    """
+    name = '<span class="name">START</span>' if world().start[state] else ""
+    return f'{name}<span class="arrows">{cell_arrows(probabilities)}</span><span class="number">{value:.2f}</span>'
 
 
 class GridPanel:
@@ -46,8 +86,9 @@ class GridPanel:
                 grid.props["aria-label"] = "Gridworld of 5 rows and 5 columns"
                 self._cells = [self._cell(state) for state in range(SIZE**2)]
             ui.label(
-                "Greener cells hold more value; the number is what the estimator takes for V. The longest arrow, in clay "
-                "orange, is the policy's favourite move. Click a cell to read its numbers."
+                "Greener cells hold more value, slate ones less than nothing; the number is what the estimator takes for V. "
+                "The longest arrow, in clay orange, is the policy's favourite move. Click a cell to read its numbers; arrow "
+                "keys go from cell to cell."
             ).classes("faint q-mt-sm")
         with panel("The cell"):
             self._details = ui.html("", sanitize=False).classes("scrolls")
@@ -57,37 +98,30 @@ class GridPanel:
         """Show the present moment."""
         moment = self._moment()
         values, probabilities = moment.values, moment.policy.probabilities
-        for state, (button, arrows, number) in enumerate(self._cells):
-            button.classes(replace=self._cell_classes(state))
-            put(button, aria_pressed="true" if state == self.chosen else "false")
-            if state in (GOAL, TRAP):
+        for state, button in enumerate(self._cells):
+            is_chosen = state == self.chosen
+            button.classes(replace=cell_classes(state, is_chosen))
+            put(button, aria_pressed=str(is_chosen).lower(), tabindex="0" if is_chosen else "-1")
+            if state in ENDS:
                 continue
             button.style(replace=cell_style(values[state]))
             favourite = f"{favourite_move(probabilities[state])} {probabilities[state].max():.0%}"
             put(button, aria_label=f"{cell_name(state)}, value {values[state]:.2f}, favourite move {favourite}")
-            arrows.content = cell_arrows(probabilities[state])
-            number.text = f"{values[state]:.2f}"
+            button.content = cell_content(state, values[state], probabilities[state])
         self._details.content = cell_table(moment, self.chosen)
 
-    def _cell(self, state: int) -> tuple[ui.element, ui.html, ui.label]:
-        with ui.element("button").on("click", lambda: self._choose(state)) as button:
-            button.props["type"] = "button"
-            button.props["data-test"] = f"cell-{state}"
-            name = {GOAL: "GOAL", TRAP: "TRAP"}.get(state) or ("START" if world().start[state] else "")
-            if name:
-                ui.label(name).classes("name")
-            arrows, number = ui.html("", sanitize=False).classes("arrows"), ui.label("").classes("number")
-            if state in (GOAL, TRAP):
-                sign, worth = ("★", "+1") if state == GOAL else ("✕", "−1")
-                ui.label(sign).classes("sign")
-                number.text = worth
-                button.props["aria-label"] = f"{cell_name(state)}, the {name.lower()}, worth {worth}"
-                button.style(cell_style(1.0 if state == GOAL else -1.0))
-        return button, arrows, number
-
-    def _cell_classes(self, state: int) -> str:
-        kind = {GOAL: " goal", TRAP: " trap"}.get(state, "")
-        return f"cell{kind}{' chosen' if state == self.chosen else ''}"
+    def _cell(self, state: int) -> ui.html:
+        button = ui.html("", sanitize=False, tag="button").on("click", lambda: self._choose(state))
+        button.props.update({"type": "button", "data-test": f"cell-{state}"})
+        if state in ENDS:
+            end = ENDS[state]
+            button.props["aria-label"] = f"{cell_name(state)}, the {end.name}, worth {end.worth}"
+            button.style(cell_style(end.value))
+            button.content = (
+                f'<span class="name">{end.name.upper()}</span><span class="sign">{end.sign}</span>'
+                f'<span class="number">{end.worth}</span>'
+            )
+        return button
 
     def _choose(self, state: int) -> None:
         self.chosen = state
@@ -100,9 +134,11 @@ def cell_table(moment: Moment, state: int) -> str:
     :param state: of the gridworld
     :return: its value, and probability and true advantage of each move, as HTML
     """
-    if state in (GOAL, TRAP):
-        name, worth = ("goal", "+1") if state == GOAL else ("trap", "−1")
-        return f"<p>{cell_name(state).capitalize()}: the {name}. Entering it is worth {worth} and ends the episode.</p>"
+    if state in ENDS:
+        end = ENDS[state]
+        return (
+            f"<p>{cell_name(state).capitalize()}: the {end.name}. Entering it is worth {end.worth} and ends the episode.</p>"
+        )
     policy, gamma = moment.policy, moment.controls.gamma
     advantages, actions = policy.advantages(gamma)[state], policy.action_values(gamma)[state]
     expected = moment.moments.advantage_mean[state]

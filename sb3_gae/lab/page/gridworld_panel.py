@@ -12,6 +12,7 @@ from sb3_gae.lab.export import recorded_run
 from sb3_gae.lab.moment import Moment
 from sb3_gae.lab.page.charts import bias_chart, return_chart, trace_chart, trace_table, variance_chart
 from sb3_gae.lab.page.grid_panel import GridPanel, cell_name
+from sb3_gae.lab.page.pace import Pace, until_shown
 from sb3_gae.lab.page.widgets import Knob, choice, panel, picture, put
 from sb3_gae.lab.presets import PRESETS, load_preset
 from sb3_gae.lab.readings import STALL_STEPS, light
@@ -19,9 +20,15 @@ from sb3_gae.lab.readings import STALL_STEPS, light
 LIGHTS = {"unbiased": "●", "slight": "▲", "biased": "■"}
 LIGHT_NAMES = {"unbiased": "unbiased", "slight": "slightly biased", "biased": "biased"}
 ORDER_NAMES = {"policy_first": "policy step first (as in the paper)", "value_first": "value fit first"}
+ABOUT = (
+    "A softmax policy on a 5 by 5 gridworld with a goal worth +1 and a trap worth −1. Each step samples a batch of episodes, "
+    "estimates the advantage at every visited step with GAE(γ, λ), the exponentially weighted sum of residuals, and takes one "
+    "policy-gradient ascent step. Bias is the angle between the estimator's expected gradient and the true gradient, both "
+    "computed exactly and on the side, only to score it: zero at λ = 1 for any value function, and growing as λ shrinks under "
+    "a wrong one. One plain ascent step on a grid that can be solved stands in for the paper's trust-region update and neural "
+    "networks. Each preset has a seed of its own, so it gives the same run every time; loading one resets it."
+)
 FASTEST, MAX_RUN = 20, 2_000
-# Seconds without an answer after which nobody seems to be looking
-_LONGEST_WAIT = 20.0
 
 
 class GridworldPanel:
@@ -32,31 +39,38 @@ class GridworldPanel:
         self.simulation = load_preset(self._preset)
         self._episode = self._start = 0
         self._timer = ui.timer(0.2, self._tick, active=False)
+        self._pace = Pace(self.refresh, self._settle)
         self._build_presets()
         self._build_run()
         with ui.element("div").classes("columns three"):
             with ui.element("div").classes("stack"):
                 with panel("Return, in parts of the best possible (dashed)"):
-                    self._returns = picture()
+                    self._returns = picture("returns")
+                    self._hint = ui.label("").classes("faint")
                 self._grid = GridPanel(self._moment)
             with ui.element("div").classes("stack"):
                 self._build_knobs()
                 with panel("Bias: angle between expected and true gradient, in radians (exact)"):
-                    self._bias = picture()
+                    self._bias = picture("bias")
                 with panel("Variance of the batch's gradient (exact)"):
-                    self._variance = picture()
+                    self._variance = picture("variance")
             with ui.element("div").classes("stack wide"):
                 self._build_estimator()
                 self._build_log()
+        with panel("What this is"):
+            ui.label(ABOUT)
         self.refresh()
 
     def refresh(self) -> None:
         """Show the simulation as it is."""
+        for name, knob in self._knobs.items():
+            knob.show(getattr(self.simulation.controls, name))
         self._refresh_readings()
         self._grid.refresh()
         readings = self.simulation.readings
         self._returns.content, self._bias.content = return_chart(readings), bias_chart(readings)
         self._variance.content = variance_chart(readings)
+        self._hint.text = "" if self.simulation.reading.step else "Run a few steps to draw the return and bias curves."
         events = [f"step {event.step}: {event.text}" for event in reversed(self.simulation.events)]
         self._log.content = "".join(f"<div>{text}</div>" for text in events) or (
             "Reach optimal or flip a control to start the log."
@@ -88,7 +102,11 @@ class GridworldPanel:
                 with ui.element("div").classes("readings") as readings:
                     readings.props["data-test"] = "readings"
                     self._step_count, self._return, self._v = ui.label(), ui.label(), ui.label()
-                    self._light, self._noise, self._status = ui.label().classes("light"), ui.label(), ui.label()
+                    self._light, self._noise, self._status = (
+                        ui.label().classes("light"),
+                        ui.label(),
+                        ui.label().classes("status"),
+                    )
             self._light.props["data-test"], self._status.props["data-test"] = "light", "status"
             self._step_count.props["data-test"] = "step-count"
 
@@ -113,7 +131,7 @@ class GridworldPanel:
                     ("learning_rate", "learning rate", 0.5, 20.0, 0.5),
                 )
             }
-            Knob("speed, steps per second", 1, FASTEST, 1, 5, self._set_speed, "speed")
+            self._speed_knob = Knob("speed, steps per second", 1, FASTEST, 1, 5, self._set_speed, "speed")
             kinds = {name: name for name in VALUE_FUNCTIONS}
             self._kind = choice("value function", kinds, "exact", self._turner("value_function"), "value_function")
             self._order = choice("order", ORDER_NAMES, "policy_first", self._turner("order"), "order")
@@ -121,10 +139,10 @@ class GridworldPanel:
     def _build_estimator(self) -> None:
         with panel("What the estimator is doing"):
             ui.label(
-                "One sampled episode of the coming step. Slate: residuals δ. Clay: the same, weighted with (γλ)^l (the curve) "
+                "One sampled episode of the coming step. Slate: residuals δ. Clay: the same, weighted with (γλ)ˡ (the curve) "
                 "and added up to the advantage of the chosen step."
             ).classes("faint")
-            self._trace = picture()
+            self._trace = picture("trace")
             self._episode_knob = Knob("episode of the batch", 1, 20, 1, 1, self._choose_episode, "episode")
             self._start_knob = Knob("step of the episode", 0, 20, 1, 0, self._choose_start, "start")
             self._share = ui.label("")
@@ -137,14 +155,14 @@ class GridworldPanel:
         self._return.text = f"return {reading.score:.0%} of the best"
         self._v.text = f"{controls.value_function} V"
         shown = light(reading.bias_angle)
-        self._light.text = f"{LIGHTS[shown]} bias: {LIGHT_NAMES[shown]} ({reading.bias_angle:.2f})"
+        self._light.text = f"{LIGHTS[shown]} bias: {LIGHT_NAMES[shown]} ({reading.bias_angle:.2f} rad)"
         self._light.classes(replace=f"light {shown}")
         self._noise.text = f"variance {reading.variance:.3f} (exact)"
         self._status.text = self.simulation.status
         recent = [each.share_of_gradient for each in self.simulation.readings[-STALL_STEPS:]]
         self._share.text = (
             f"The gradients of the last {len(recent)} batches have {np.mean(recent):.0%} of the true one (sampled). "
-            "Unbiased estimates have 100 % on average."
+            "Unbiased estimates have 100% on average."
         )
         self._story.text = PRESETS[self._preset].story
         for name, button in self._preset_buttons.items():
@@ -155,6 +173,8 @@ class GridworldPanel:
         shown = trace(self._moment(), self._episode, self._start)
         self._episode_knob.set_high(self.simulation.controls.batch_size)
         self._start_knob.set_high(len(shown.deltas) - 1)
+        self._episode_knob.show(shown.episode + 1)
+        self._start_knob.show(shown.start)
         self._trace.content = trace_chart(shown)
         self._sum.content = trace_table(shown, cell_name(int(shown.states[shown.start])))
 
@@ -165,7 +185,7 @@ class GridworldPanel:
             except (TypeError, ValueError) as error:
                 ui.notify(str(error), type="negative")
                 return
-            self.refresh()
+            self._pace.ask()
 
         return turn
 
@@ -182,16 +202,19 @@ class GridworldPanel:
     def _show_controls(self) -> None:
         # What they report back are the values that the simulation has already
         controls = self.simulation.controls
-        for name, knob in self._knobs.items():
-            knob.set(getattr(controls, name))
         self._kind.value, self._order.value = controls.value_function, controls.order
         self.refresh()
+        self._settle()
+
+    def _settle(self) -> None:
+        for knob in (*self._knobs.values(), self._speed_knob, self._episode_knob, self._start_knob):
+            knob.settle()
 
     async def _tick(self) -> None:
         self._advance()
         # A browser that is slower than the speed asked for would fall behind without end; the next step waits for it
         try:
-            await ui.run_javascript("return true", timeout=_LONGEST_WAIT)
+            await until_shown()
         except TimeoutError:
             self._pause()
 
@@ -202,6 +225,8 @@ class GridworldPanel:
             return
         self.simulation.step()
         self.refresh()
+        # The next episode may be shorter than the step that was chosen
+        self._start_knob.settle()
 
     def _step_once(self) -> None:
         self._pause()
@@ -220,19 +245,18 @@ class GridworldPanel:
         self._play.text = "Play"
         self._play.props["icon"] = "play_arrow"
 
-    def _set_speed(self, value: Any) -> None:
-        if isinstance(value, int | float) and 1 <= value <= FASTEST:
-            self._timer.interval = 1.0 / value
+    def _set_speed(self, value: float) -> None:
+        self._timer.interval = 1.0 / value
+        self._speed_knob.show(value)
+        self._pace.ask()
 
-    def _choose_episode(self, value: Any) -> None:
-        if isinstance(value, int | float) and value >= 1:
-            self._episode = int(value) - 1
-            self._refresh_estimator()
+    def _choose_episode(self, value: float) -> None:
+        self._episode = int(value) - 1
+        self._pace.ask()
 
-    def _choose_start(self, value: Any) -> None:
-        if isinstance(value, int | float) and value >= 0:
-            self._start = int(value)
-            self._refresh_estimator()
+    def _choose_start(self, value: float) -> None:
+        self._start = int(value)
+        self._pace.ask()
 
     def _export(self) -> None:
         title = PRESETS[self._preset].title

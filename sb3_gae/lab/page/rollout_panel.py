@@ -1,12 +1,11 @@
 """The robot's part of the page: one recorded rollout, γ and λ."""
 
-from typing import Any
-
 import numpy as np
 from nicegui import events, ui
 
+from sb3_gae.lab.page.pace import Pace
 from sb3_gae.lab.page.widgets import Knob, panel, picture
-from sb3_gae.lab.pictures import Axes, Line, bar_chart, line_chart, round_up
+from sb3_gae.lab.pictures import Axes, Band, Line, bar_chart, line_chart, round_up
 from sb3_gae.lab.rollout_view import RolloutViewer, View
 from sb3_gae.rollout_file import MAX_BYTES, load_rollout
 
@@ -27,6 +26,7 @@ class RolloutPanel:
                 self._build_advantages()
             with ui.element("div").classes("stack"):
                 self._build_statistics()
+        self._pace = Pace(self.refresh, self._settle)
         self.refresh()
 
     def refresh(self) -> None:
@@ -38,15 +38,13 @@ class RolloutPanel:
             f"collected with γ = {rollout.gamma:g} and λ = {rollout.gae_lambda:g}"
         )
         self._trajectory_knob.set_high(self._viewer.n_trajectories)
+        self._trajectory_knob.show(self._trajectory + 1)
+        self._gamma_knob.show(self._gamma)
+        self._lambda_knob.show(self._gae_lambda)
         self._advantages.content = advantage_chart(view, self._viewer.steps(self._trajectory))
         self._trade_off.content = trade_off_chart(view)
         self._response.content = response_chart(*self._viewer.response(self._gamma), self._gamma * self._gae_lambda)
-        bias, variance = view.bias_squared, view.variance
-        self._summary.text = (
-            f"At λ = {self._gae_lambda:g}: bias² {bias.value[-1]:.3f} ± {bias.standard_error[-1]:.3f}, "
-            f"variance {variance.value[-1]:.3f} ± {variance.standard_error[-1]:.3f} of what it is at λ = 1 (estimated from "
-            "this rollout alone)"
-        )
+        self._summary.text = summary(view)
 
     def _build_controls(self) -> None:
         with panel("The rollout"), ui.element("div").classes("stack"):
@@ -67,35 +65,42 @@ class RolloutPanel:
 
     def _build_advantages(self) -> None:
         with panel("Advantages along the trajectory"):
-            ui.label("Line: with the λ of the dial. Dashed: with λ = 1. Bars: residuals δ.").classes("faint")
-            self._advantages = picture()
+            explanation = "Line: with the λ of the dial. Dashed: with λ = 1. Bars: residuals δ. In units of the reward."
+            ui.label(explanation).classes("faint")
+            self._advantages = picture("advantages")
 
     def _build_statistics(self) -> None:
-        with panel("Bias² (solid) and variance (dashed) of the batch's policy gradient for each λ"):
-            self._trade_off = picture()
-            self._summary = ui.label("").classes("faint")
+        with panel("Bias and variance of the batch's policy gradient for each λ"):
+            ui.label(
+                "Clay, solid: bias², with a band of one standard error to either side. Slate, dashed: variance. Both in units "
+                "of the variance at λ = 1. Dotted: the dial."
+            ).classes("faint")
+            self._trade_off = picture("trade-off")
+            self._summary = ui.label("")
             self._summary.props["data-test"] = "rollout-summary"
         with panel("Response of the policy gradient by delay"):
             ui.label(
                 "‖E[∇log π · x at l steps later]‖²: what remains of the response function χ(l) where states do not recur. "
-                "Slate: rewards. Clay: residuals, which V has shaped. Curve: the weights (γλ)^l. Each in units of its largest."
+                "Slate: rewards. Clay: residuals, which V has shaped. Curve: the weights (γλ)ˡ. Each in units of its largest; "
+                "bars below zero are noise of the estimate."
             ).classes("faint")
-            self._response = picture()
+            self._response = picture("response")
 
-    def _turn_lambda(self, value: Any) -> None:
-        if isinstance(value, int | float) and 0.0 <= value <= 1.0:
-            self._gae_lambda = float(value)
-            self.refresh()
+    def _settle(self) -> None:
+        for knob in (self._trajectory_knob, self._gamma_knob, self._lambda_knob):
+            knob.settle()
 
-    def _turn_gamma(self, value: Any) -> None:
-        if isinstance(value, int | float) and 0.0 <= value <= 1.0:
-            self._gamma = float(value)
-            self.refresh()
+    def _turn_lambda(self, value: float) -> None:
+        self._gae_lambda = float(value)
+        self._pace.ask()
 
-    def _choose(self, value: Any) -> None:
-        if isinstance(value, int | float) and 1 <= value <= self._viewer.n_trajectories:
-            self._trajectory = int(value) - 1
-            self.refresh()
+    def _turn_gamma(self, value: float) -> None:
+        self._gamma = float(value)
+        self._pace.ask()
+
+    def _choose(self, value: float) -> None:
+        self._trajectory = int(value) - 1
+        self._pace.ask()
 
     async def _load(self, event: events.UploadEventArguments) -> None:
         try:
@@ -111,13 +116,8 @@ class RolloutPanel:
         self._complaint.text = ""
         self._viewer, self._trajectory = viewer, 0
         self._gamma, self._gae_lambda = viewer.rollout.gamma, viewer.rollout.gae_lambda
-        for knob, value in (
-            (self._trajectory_knob, 1),
-            (self._gamma_knob, self._gamma),
-            (self._lambda_knob, self._gae_lambda),
-        ):
-            knob.set(value)
         self.refresh()
+        self._settle()
 
 
 def advantage_chart(view: View, steps: tuple[np.ndarray, np.ndarray]) -> str:
@@ -133,6 +133,26 @@ def advantage_chart(view: View, steps: tuple[np.ndarray, np.ndarray]) -> str:
     return bar_chart(axes, [curves[2]], ["delta"], lines)
 
 
+def summary(view: View) -> str:
+    """
+    :param view: of the rollout
+    :return: bias and variance at the chosen λ, and whether there is any bias to be seen
+    """
+    gae_lambda = view.lambdas[-1]
+    (bias, bias_error), (variance, variance_error) = (
+        (each.value[-1], each.standard_error[-1]) for each in (view.bias_squared, view.variance)
+    )
+    verdict = "more than two standard errors above zero"
+    if gae_lambda == 1.0:
+        verdict = "zero by definition, as λ = 1 is what the others are compared with"
+    elif not bias > 2.0 * bias_error:
+        verdict = "cannot be told from zero with this rollout"
+    return (
+        f"At λ = {gae_lambda:g}: bias² {bias:.3f} ± {bias_error:.3f}, {verdict}; "
+        f"variance {variance:.3f} ± {variance_error:.3f}. Estimated from this rollout alone, with one standard error each."
+    )
+
+
 def trade_off_chart(view: View) -> str:
     """
     :param view: of the rollout
@@ -141,12 +161,15 @@ def trade_off_chart(view: View) -> str:
     order = np.argsort(view.lambdas, kind="stable")
     # λ between 0.9 and 1 is where things happen: places by the logarithm of the horizon
     places = -np.log(1.0 - 0.99 * view.lambdas) / np.log(100.0)
-    axes = Axes(
-        "Bias squared and variance for each λ", (0.0, 1.0), (0.0, 1.0), x_label="λ from 0 to 1, places by log of the horizon"
-    )
-    bias = Line(places[order], np.maximum(view.bias_squared.value[order], 0.0), "bias")
+    value, error = (array[order] for array in view.bias_squared)
+    label = "Bias squared and variance for each λ"
+    top = round_up(max(1.0, float(value.max())))
+    axes = Axes(label, (0.0, 1.0), (0.0, top), x_label="λ from 0 to 1, places by log of the horizon")
+    bias = Line(places[order], value, "bias")
     variance = Line(places[order], view.variance.value[order], "variance")
-    return line_chart(axes, [bias, variance], marks=[float(places[-1])])
+    error = np.nan_to_num(error)
+    band = Band(places[order], value - error, value + error, "bias")
+    return line_chart(axes, [bias, variance], [float(places[-1])], [band])
 
 
 def response_chart(rewards: np.ndarray, shaped: np.ndarray, decay: float) -> str:

@@ -6,53 +6,63 @@ from typing import Any
 
 from nicegui import ui
 
+# Seconds between two values of a drag
+_THROTTLE = 0.02
+
 
 class Knob:
     """
-    A slider under its name and value.
+    A slider under its name and value. What it is turned to is shown by whoever made it, together with what follows from it.
 
     :param name: as it is shown, and said by a screen reader
     :param low: end of the slider
     :param high: end of the slider
     :param step: of the slider
     :param value: to begin with
-    :param on_change: called with the new value, also while it is dragged
+    :param on_change: called with the new value, also while it is dragged; it is shown by :meth:`show` and :meth:`settle`
     :param marker: for tests, to find it by
     """
 
     def __init__(
-        self, name: str, low: float, high: float, step: float, value: float, on_change: Callable[[Any], None], marker: str
+        self, name: str, low: float, high: float, step: float, value: float, on_change: Callable[[float], None], marker: str
     ):
         with ui.element("div").classes("w-full"):
             with ui.element("div").classes("knob-name"):
                 ui.label(name)
                 self._shown = ui.label(f"{value:g}")
-            self.slider = ui.slider(min=low, max=high, step=step, value=value, on_change=lambda event: self._turn(event.value))
-            self.slider.props["aria-label"] = name
-            self.slider.props["data-test"] = marker
+                self._shown.props["data-test"] = f"{marker}-shown"
+            # Not ui.slider, which sends a drag on every 50 milliseconds only
+            self._slider = ui.element("q-slider").on(
+                "update:model-value", lambda event: self._turn(event.args), throttle=_THROTTLE
+            )
+            self._slider.props.update({"min": low, "max": high, "step": step, "model-value": value})
+            self._slider.props.update({"aria-label": name, "data-test": marker})
         # Quasar's slider knows the arrows and page keys only
-        self.slider.on("keydown.home", lambda: self.slider.set_value(low))
-        self.slider.on("keydown.end", lambda: self.slider.set_value(self.slider.props["max"]))
-        self._on_change = on_change
+        self._slider.on("keydown.home", lambda: self._turn(low))
+        self._slider.on("keydown.end", lambda: self._turn(self._slider.props["max"]))
+        self._on_change, self._value = on_change, value
 
-    def set(self, value: float) -> None:
+    def show(self, value: float) -> None:
         """
-        :param value: to show; the page is told as if it had been dragged there
+        :param value: that the number has from now on; the slider is there already, or about to be settled
         """
-        self.slider.value = value
+        self._value = value
         self._shown.text = f"{value:g}"
+
+    def settle(self) -> None:
+        """Tell the slider where it is. Not while it is turned: it would be put back to where it was a moment ago."""
+        put(self._slider, model_value=self._value)
 
     def set_high(self, high: float) -> None:
         """
         :param high: new end of the slider
         """
-        if self.slider.props["max"] != high:
-            self.slider.props["max"] = high
+        put(self._slider, max=high)
 
     def _turn(self, value: Any) -> None:
-        if isinstance(value, int | float):
-            self._shown.text = f"{value:g}"
-        self._on_change(value)
+        # Whatever a page may send
+        if isinstance(value, int | float) and self._slider.props["min"] <= value <= self._slider.props["max"]:
+            self._on_change(value)
 
 
 def choice(name: str, options: dict[str, str], value: str, on_change: Callable[[Any], None], marker: str) -> ui.radio:
@@ -85,9 +95,14 @@ def put(element: ui.element, **props: Any) -> None:
         element.props.update(new)
 
 
-def picture() -> ui.html:
-    """:return: a place for the SVG of :mod:`sb3_gae.lab.pictures`, which needs no sanitizing as it is made of numbers"""
-    return ui.html("", sanitize=False).classes("w-full")
+def picture(marker: str) -> ui.html:
+    """
+    :param marker: for tests, to find it by
+    :return: a place for the SVG of :mod:`sb3_gae.lab.pictures`, which needs no sanitizing as it is made of numbers
+    """
+    place = ui.html("", sanitize=False).classes("w-full")
+    place.props["data-test"] = marker
+    return place
 
 
 @contextmanager
