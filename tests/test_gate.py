@@ -1,0 +1,72 @@
+"""The gate's arithmetic; what it measures is left to `python -m benchmarks.gate`, since tests do not time things."""
+
+import json
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.gate.bands import LEARNING_DEVIATIONS, SPEED_MARGIN, Band, learning_band, speed_band, verdicts
+from benchmarks.gate.learning import RUNS, SEEDS
+from benchmarks.gate.plants import PLANTS, twice
+from benchmarks.gate.records import RECORDS, bands
+
+
+def test_a_band_for_learning_reaches_as_far_as_the_error_of_two_means() -> None:
+    recorded = [1.0, 2.0, 3.0, 6.0]
+    band = learning_band(recorded, n_seeds=2)
+    deviation = math.sqrt(sum((score - 3.0) ** 2 for score in recorded) / 3.0)
+    reach = LEARNING_DEVIATIONS * deviation * math.sqrt(1 / 2 + 1 / 4)
+    assert band == pytest.approx((3.0 - reach, 3.0 + reach))
+
+
+def test_unchanged_learning_stays_in_its_band_and_a_shift_of_six_errors_does_not() -> None:
+    generator = np.random.default_rng(0)
+    draws = generator.normal(10.0, 2.0, size=(2_000, 26))
+    inside = [learning_band(row[:20], 6).holds(row[20:].mean()) for row in draws]
+    assert np.mean(inside) > 0.998
+    shifted = [learning_band(row[:20], 6).holds(row[20:].mean() - 6.0 * 2.0 * math.sqrt(1 / 6 + 1 / 20)) for row in draws]
+    assert np.mean(shifted) < 0.05
+
+
+def test_a_band_for_speed_has_no_lower_end() -> None:
+    band = speed_band([0.9, 1.0, 0.8])
+    assert band == Band(0.0, SPEED_MARGIN)
+    assert band.holds(0.1)
+    assert not band.holds(1.2)
+    assert not band.holds(math.nan)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: learning_band([1.0], 2), "at least two scores, got 1"),
+        (lambda: speed_band([]), "at least one ratio"),
+        (lambda: verdicts({"new": 1.0}, {}), "Nothing is recorded of new"),
+    ],
+)
+def test_too_little_is_refused(call: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        call()  # type: ignore[operator]
+
+
+def test_what_is_recorded_covers_what_is_run_with_other_seeds() -> None:
+    records = json.loads(RECORDS.read_text())
+    assert set(bands(records, "learning", len(SEEDS))) == set(RUNS)
+    for scores in records["learning"].values():
+        assert len(scores) >= 20
+        assert not set(map(int, scores)) & set(SEEDS)
+    assert {part for _, part in PLANTS.values()} == {"speed", "learning"} <= set(records)
+
+
+def test_a_plant_does_the_work_two_times_and_goes_away() -> None:
+    calls = []
+    assert twice(lambda number: calls.append(number) or number)(3) == 3
+    assert calls == [3, 3]
+    for plant, _ in PLANTS.values():
+        with plant() as patched:
+            assert patched is not None
