@@ -2,7 +2,8 @@
 The state of environments, so that a later process can go on where this one stopped.
 
 An environment, a wrapper or a ``VecEnv`` with the methods ``state_dict`` and ``load_state_dict`` says itself what its
-state is, apart from what it wraps, or returns None if it cannot. Of all others in a ``DummyVecEnv`` the attributes are taken, if they can be pickled.
+state is, apart from what it wraps, or gives None if it cannot. Of all others in a ``DummyVecEnv`` the attributes are taken,
+if they can be pickled.
 """
 
 import io

@@ -136,7 +136,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
     def __init__(
         self,
         policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
+        env: GymEnv | str | Callable[[], GymEnv],
         learning_rate: float | Schedule | None = None,
         n_steps: int = 2048,
         batch_size: int | None = None,
@@ -182,7 +182,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
             env = env_on_workers(env, rollout_workers)
         super().__init__(
             policy,
-            env,
+            cast(GymEnv | str, env),
             learning_rate=1e-3 if learning_rate is None else learning_rate,
             n_steps=n_steps,
             gamma=gamma,
@@ -297,8 +297,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
     ) -> list[TerminalObservation] | None:
         """Take the steps of a rollout, and return where time limits struck; nothing if the callback ended training."""
         terminal: list[TerminalObservation] = []
-        n_steps = 0
-        for step in self._steps(env, n_rollout_steps, quota):
+        for n_steps, step in enumerate(self._steps(env, n_rollout_steps, quota)):
             actions, clipped_actions, new_obs = step.actions, step.clipped_actions, step.new_observations
             rewards, dones, infos = step.rewards, step.dones, step.infos
             self.num_timesteps += step.n_taken
@@ -314,10 +313,10 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
                 truncated[[ending.env for ending in endings]] = True
             rollout_buffer.add_step(step.observations, actions, rewards, step.episode_starts, dones, truncated, counts)
             quota.add(dones)
-            n_steps += 1
             self._last_obs = new_obs
             self._last_episode_starts = dones
         # For the end of the rollout, when the number of steps is one more
+        n_steps = rollout_buffer.pos
         callback.update_locals(locals())
         return terminal
 

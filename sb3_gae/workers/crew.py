@@ -5,6 +5,7 @@ import socket
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -43,7 +44,9 @@ class Crew:
         )
         self._actors = [self._new_actor(index, is_replacement=False) for index in range(len(makers))]
         #: of each worker: number of environments, observation space and action space
-        self.descriptions: list[tuple[int, spaces.Space, spaces.Space]] = self.ask("start", [()] * len(makers), patience=_SECONDS_TO_START)
+        self.descriptions: list[tuple[int, spaces.Space, spaces.Space]] = self.ask(
+            "start", [()] * len(makers), patience=_SECONDS_TO_START
+        )
 
     def __len__(self) -> int:
         return len(self._actors)
@@ -114,7 +117,7 @@ class Crew:
         self._actors = []
 
     def _new_actor(self, worker: int, is_replacement: bool) -> Any:
-        return self._actor_class.remote(self._makers[worker], self._cpus_per_worker, os.getcwd(), is_replacement)
+        return self._actor_class.remote(self._makers[worker], self._cpus_per_worker, str(Path.cwd()), is_replacement)
 
     def _submit(self, worker: int, method: str, arguments: tuple[Any, ...]) -> Any:
         return getattr(self._actors[worker], method).remote(*arguments)

@@ -1,6 +1,7 @@
 """Environments on Ray workers, behind SB3's ``VecEnv``."""
 
 import functools
+import itertools
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -179,8 +180,8 @@ class RayVecEnv(VecEnv):
         """
         if len(states) != self.n_workers:
             raise ValueError(
-                f"`n_workers` must be that of the checkpoint, {len(states)}, but is {self.n_workers}: another number of workers "
-                "draws other random numbers."
+                f"`n_workers` must be that of the checkpoint, {len(states)}, but is {self.n_workers}: other workers draw other "
+                "random numbers."
             )
         self._crew.ask("go_on_from", [(state,) for state in states])
         self._states = list(states)
@@ -198,7 +199,9 @@ class RayVecEnv(VecEnv):
         self._states = None
         self._ask_those(indices, "set_attr", attr_name, value)
 
-    def env_method(self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
         self._states = None
         return self._ask_those(indices, "env_method", method_name, *method_args, **method_kwargs)
 
@@ -207,7 +210,7 @@ class RayVecEnv(VecEnv):
 
     @property
     def _slices(self) -> list[slice]:
-        return [slice(start, end) for start, end in zip(self._borders[:-1], self._borders[1:], strict=True)]
+        return [slice(start, end) for start, end in itertools.pairwise(self._borders)]
 
     def _ask_those(self, indices: VecEnvIndices, method: str, *args: Any, **kwargs: Any) -> list[Any]:
         """Each worker that has some of the environments, about these; in the order of the indices."""
@@ -232,7 +235,7 @@ def parts_of(env_fns: Sequence[Any], n_workers: int) -> list[list[Any]]:
     """
     size, n_larger = divmod(len(env_fns), n_workers)
     ends = [size * worker + min(worker, n_larger) for worker in range(n_workers + 1)]
-    return [list(env_fns[start:end]) for start, end in zip(ends[:-1], ends[1:], strict=True)]
+    return [list(env_fns[start:end]) for start, end in itertools.pairwise(ends)]
 
 
 def share_seed(seed: int, worker: int) -> int:
@@ -255,7 +258,7 @@ def env_on_workers(env: Any, n_workers: int) -> VecEnv:
     check_count("rollout_workers", n_workers)
     if isinstance(env, VecEnv) and isinstance(base := env.unwrapped, RayVecEnv):
         if base.n_workers != n_workers:
-            raise ValueError(f"`rollout_workers` = {n_workers}, but `env` is on {base.n_workers} workers; leave one of them out.")
+            raise ValueError(f"`rollout_workers` = {n_workers}, but `env` is on {base.n_workers} workers; leave it out.")
         return env
     if isinstance(env, str):
         env = functools.partial(gym.make, gym.spec(env))

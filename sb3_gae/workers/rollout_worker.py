@@ -96,7 +96,9 @@ class RolloutWorker:
         self._episode_starts = np.ones(self._env.num_envs, dtype=bool)
         return self._env.num_envs, self._env.observation_space, self._env.action_space
 
-    def reset(self, seeds: Sequence[int | None], options: list[dict[str, Any]]) -> tuple[Observations, list[dict], bytes | None]:
+    def reset(
+        self, seeds: Sequence[int | None], options: list[dict[str, Any]]
+    ) -> tuple[Observations, list[dict], bytes | None]:
         """
         :param seeds: of each environment, None to go on with its own random numbers
         :param options: of each environment
