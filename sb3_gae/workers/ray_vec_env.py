@@ -2,9 +2,10 @@
 
 import functools
 import itertools
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -22,6 +23,24 @@ from sb3_gae.workers.crew import Crew
 from sb3_gae.workers.rollout_worker import ShareOrder, portable_policy, weights_of
 from sb3_gae.workers.share import Share, batch_steps, joined
 from sb3_gae.workers.wrappers import learn_from_shares, normalizer_of, wrappers_around, wrappers_to_send
+
+
+class CollectionRecord(NamedTuple):
+    """
+    What the last batch took.
+
+    :param seconds: from the order to the last share
+    :param worker_seconds: that the slowest worker needed of them
+    :param weights_bytes: that went to each worker
+    :param shares_bytes: of the arrays that came back
+    :param states_bytes: of the environments, that came back with them
+    """
+
+    seconds: float
+    worker_seconds: float
+    weights_bytes: int
+    shares_bytes: int
+    states_bytes: int
 
 
 class RayVecEnv(VecEnv):
@@ -72,6 +91,8 @@ class RayVecEnv(VecEnv):
         self._policy: ActorCriticPolicy | None = None
         self._policy_content = b""
         self._actions: np.ndarray | None = None
+        #: None before the first batch
+        self.last_collection: CollectionRecord | None = None
 
     @property
     def n_workers(self) -> int:
@@ -121,15 +142,17 @@ class RayVecEnv(VecEnv):
     def _collect_shares(
         self, policy: ActorCriticPolicy, plan: RolloutPlan, wrappers: list[bytes | None], with_moments: bool
     ) -> list[Share]:
+        start = time.perf_counter()
         before = th.get_rng_state()
         seed = int(th.randint(2**62, ()))
         try:
             self._send_policy(policy)
             if self._states is None:
                 self._states = self._crew.ask("state", [()] * self.n_workers)
-            weights = self._crew.share(weights_of(policy))
+            weights = weights_of(policy)
+            for_all = self._crew.share(weights)
             orders = [
-                (ShareOrder(plan, share_seed(seed, worker), wrappers, with_moments, first_env), weights)
+                (ShareOrder(plan, share_seed(seed, worker), wrappers, with_moments, first_env), for_all)
                 for worker, first_env in enumerate(self._borders[:-1])
             ]
             answers = self._crew.ask("collect", orders, replaced=self._go_on_where_it_stood)
@@ -138,7 +161,15 @@ class RayVecEnv(VecEnv):
             th.set_rng_state(before)
             raise
         self._states = [state for _, state in answers]
-        return [share for share, _ in answers]
+        shares = [share for share, _ in answers]
+        self.last_collection = CollectionRecord(
+            seconds=time.perf_counter() - start,
+            worker_seconds=max(share.seconds for share in shares),
+            weights_bytes=sum(array.nbytes for array in weights.values()),
+            shares_bytes=sum(share.n_bytes for share in shares),
+            states_bytes=sum(len(state) for state in self._states if state is not None),
+        )
+        return shares
 
     def _send_policy(self, policy: ActorCriticPolicy) -> None:
         if policy is not self._policy:

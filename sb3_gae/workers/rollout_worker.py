@@ -5,6 +5,7 @@ import io
 import os
 import pickle
 import random
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -127,7 +128,7 @@ class RolloutWorker:
         """
         :param content: what :func:`portable_policy` returned
         """
-        self._policy = th.load(io.BytesIO(content), map_location="cpu", pickle_module=cloudpickle, weights_only=False)
+        self._policy = th.load(io.BytesIO(content), map_location="cpu", weights_only=False)
 
     def collect(self, order: ShareOrder, weights: Weights) -> tuple[Share, bytes | None]:
         """
@@ -137,6 +138,7 @@ class RolloutWorker:
         :raises NumericalError: if an observation, action or reward is not finite
         """
         assert self._policy is not None and self._observations is not None
+        start = time.perf_counter()
         self._policy.load_state_dict({name: th.tensor(array) for name, array in weights.items()})
         self._policy.set_training_mode(False)
         _seed_process(order.seed)
@@ -145,7 +147,8 @@ class RolloutWorker:
         seen = seen_through(env, self._observations)
         share = collect_share(self._policy, env, seen, self._episode_starts, order.plan, order.first_env)
         self._observations, self._episode_starts = watch.observations, share.dones[-1]
-        return share._replace(moments=watch.total()), self.state()
+        moments, state = watch.total(), self.state()
+        return share._replace(moments=moments, seconds=time.perf_counter() - start), state
 
     def state(self) -> bytes | None:
         """

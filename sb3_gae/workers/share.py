@@ -39,6 +39,7 @@ class Share(NamedTuple):
     :param dones: whether each step was the last of its episode, shape (T, n)
     :param endings: infos of the last steps of episodes; others stay where they are
     :param moments: of the observations as the environments gave them; empty if nobody keeps statistics of them
+    :param seconds: that the worker took
     """
 
     observations: Observations
@@ -49,6 +50,15 @@ class Share(NamedTuple):
     dones: np.ndarray
     endings: list[Ending]
     moments: ObservationMoments
+    seconds: float
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the arrays, in bytes."""
+        arrays = [self.episode_starts, self.actions, self.rewards, self.dones]
+        for observations in (self.observations, self.last_observations):
+            arrays.extend(observations.values() if isinstance(observations, dict) else [observations])
+        return sum(array.nbytes for array in arrays)
 
 
 def collect_share(
@@ -68,7 +78,7 @@ def collect_share(
     :param episode_starts: whether they stand at the beginning of an episode, shape (n,)
     :param plan: how many steps to take
     :param first_env: number of the first environment in the whole batch, for messages
-    :return: the share, without moments
+    :return: the share, without moments and time
     :raises NumericalError: if an observation, action or reward is not finite
     """
     quota = EpisodeQuota(env.num_envs, plan.n_episodes)
@@ -88,6 +98,7 @@ def collect_share(
         dones=np.stack([step.dones for step in steps]),
         endings=endings,
         moments={},
+        seconds=0.0,
     )
 
 
