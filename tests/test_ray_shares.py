@@ -50,7 +50,10 @@ def make_model(env: VecEnv, **kwargs: Any) -> TRPOGAE:
 
 
 def trained(env: VecEnv, callback: BaseCallback | None = None, iterations: int = 2, **kwargs: Any) -> dict[str, Any]:
-    return everything(make_model(env, **kwargs).learn(iterations * STEPS, callback=callback))
+    found = everything(make_model(env, **kwargs).learn(iterations * STEPS, callback=callback))
+    if isinstance(observations := found["_last_obs"], dict):
+        found |= {"_last_obs": 0.0} | {f"_last_obs {key}": part for key, part in observations.items()}
+    return found
 
 
 class DrawAsWorkers(BaseCallback):

@@ -5,7 +5,6 @@ A wrapper stands in the process of the learner and sees no step of a share. So t
 own environments, with the statistics of the beginning of the batch, and send back what it is to learn.
 """
 
-import copy
 import functools
 import pickle
 from collections.abc import Mapping, Sequence
@@ -165,7 +164,9 @@ def running_returns(rewards: np.ndarray, episode_starts: np.ndarray, start: np.n
 
 
 def _at_rest(normalize: VecNormalize) -> VecNormalize:
-    resting = copy.copy(normalize)
+    # Not by ``copy``, which takes away what pickling it then looks for
+    resting = object.__new__(type(normalize))
+    vars(resting).update(vars(normalize))
     # Rewards are needed as they are, for the statistics; the learner scales them
     resting.training, resting.norm_reward = False, False
     if normalize.norm_obs:
