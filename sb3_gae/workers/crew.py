@@ -20,7 +20,7 @@ _MOST_LOSSES = 3
 # Seconds between looks at whether Ray is still there
 _PULSE = 1.0
 # Seconds that a cluster has to find a place for a worker, which may be the time to start a machine
-_SECONDS_TO_WARN, _SECONDS_TO_START = 30.0, 900.0
+_SECONDS_TO_WARN, _SECONDS_TO_START = 60.0, 900.0
 
 
 class Crew:
@@ -93,9 +93,9 @@ class Crew:
                 self._check_ray()
                 waited = time.monotonic() - start
                 if patience is not None and waited > patience:
-                    raise WorkersLostError(f"{self._no_place(len(pending))} None was found in {patience:.0f} s.")
+                    raise WorkersLostError(self._no_place(len(pending), waited))
                 if patience is not None and waited > _SECONDS_TO_WARN and not has_warned:
-                    warnings.warn(f"{self._no_place(len(pending))} Still waiting.", stacklevel=3)
+                    warnings.warn(f"{self._no_place(len(pending), waited)} Still waiting.", stacklevel=3)
                     has_warned = True
             for reference in ready:
                 worker = pending.pop(reference)
@@ -160,10 +160,11 @@ class Crew:
             self._ray.shutdown()
             raise WorkersLostError(f"Ray at {self._gcs_address} is gone ({error}), and the workers with it.") from error
 
-    def _no_place(self, n_missing: int) -> str:
+    def _no_place(self, n_missing: int, seconds: float) -> str:
+        cpus = [resources().get("CPU", 0) for resources in (self._ray.available_resources, self._ray.cluster_resources)]
         return (
-            f"Ray has no place for {n_missing} of {len(self)} workers of {self._cpus_per_worker} CPU each, with "
-            f"{self._ray.available_resources().get('CPU', 0):g} CPUs free; add machines or use fewer workers."
+            f"{n_missing} of {len(self)} workers of {self._cpus_per_worker} CPU each have not started in {seconds:.0f} s; Ray has "
+            f"{cpus[0]:g} of {cpus[1]:g} CPUs free. If it has no place for them, add machines or use fewer workers."
         )
 
 
