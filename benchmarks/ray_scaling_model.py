@@ -90,7 +90,7 @@ def predict(costs: Costs, workers: int, batch: int, bytes_per_second: float, cor
 
 def first_at_limit(costs: Costs, batch: int, bytes_per_second: float, cores: int = 1) -> int | None:
     """
-    :return: the smallest number of workers, up to one for each step, with which the learner is the limit; None if there is none
+    :return: the smallest number of workers, up to one for each step, with which the learner is the limit; None if none is
     """
     low, high = 1, batch
     if not predict(costs, high, batch, bytes_per_second, cores).learner_is_the_limit:

@@ -132,8 +132,8 @@ def report(rows: Sequence[dict[str, Any]]) -> None:
     for way, values in sorted(speeds.items(), key=lambda item: -median(item[1])):
         ratios = [ours / theirs for ours, theirs in zip(speeds[fastest], values, strict=True)]
         print(
-            f"  {way[0]:28s} {way[1]:3d} workers {way[2]:4d} envs {median(values):9.0f} steps/s; {fastest[1]} Ray worker(s) are "
-            f"{median(ratios):.2f} times as fast ({min(ratios):.2f} to {max(ratios):.2f})"
+            f"  {way[0]:28s} {way[1]:3d} workers {way[2]:4d} envs {median(values):9.0f} steps/s; {fastest[1]} Ray worker(s) "
+            f"are {median(ratios):.2f} times as fast ({min(ratios):.2f} to {max(ratios):.2f})"
         )
 
 

@@ -58,7 +58,7 @@ class LocalCrew:
         self._workers = []
 
     def _new(self, worker: int, is_replacement: bool) -> RolloutWorker:
-        return RolloutWorker(cloudpickle.loads(self._makers[worker]), 1, os.getcwd(), is_replacement)
+        return RolloutWorker(cloudpickle.loads(self._makers[worker]), 1, str(Path.cwd()), is_replacement)
 
     def _ask_one(self, worker: int, method: str, arguments: tuple[Any, ...]) -> Any:
         with _as_it_was():

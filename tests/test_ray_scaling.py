@@ -44,7 +44,9 @@ def test_the_learner_is_the_limit_from_where_its_part_is_the_longer_one() -> Non
     assert first_at_limit(free, 1_000, GIGABYTE) is None
 
 
-def rows(worker_s: float, collection_s: float, workers: int = 1, task: str = "task", way: str = "ray workers") -> dict[str, str]:
+def rows(
+    worker_s: float, collection_s: float, workers: int = 1, task: str = "task", way: str = "ray workers"
+) -> dict[str, str]:
     return {
         **{"task": task, "way": way, "workers": str(workers), "batch": "1000"},
         **{"rollout_s": str(collection_s + 0.5), "update_s": "3.0", "collection_s": str(collection_s)},
@@ -56,7 +58,7 @@ def test_costs_are_medians_of_the_rows_with_the_fewest_workers() -> None:
     measured = [rows(2.0, 2.2), rows(4.0, 4.3), rows(3.0, 3.1), rows(1.0, 9.0, workers=2), rows(9.0, 9.0, task="other")]
     costs = costs_from(measured, "task")
     assert costs == pytest.approx(Costs(3e-3, 5e-4, 3.0, 4000.0, 100.0, 0.2))
-    with pytest.raises(ValueError, match="no rows of another with workers; run benchmarks/ray_speed.py first"):
+    with pytest.raises(ValueError, match=r"no rows of another with workers; run benchmarks/ray_speed\.py first"):
         costs_from(measured, "another")
 
 

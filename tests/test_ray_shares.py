@@ -40,7 +40,9 @@ def local_workers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     yield
 
 
-def on_workers(make: Callable[[], gym.Env] | str = "CartPole-v1", n_workers: int = 2, n_envs: int = 3, **kwargs: Any) -> VecEnv:
+def on_workers(
+    make: Callable[[], gym.Env] | str = "CartPole-v1", n_workers: int = 2, n_envs: int = 3, **kwargs: Any
+) -> VecEnv:
     return make_vec_env(make, n_envs, vec_env_cls=RayVecEnv, vec_env_kwargs={"n_workers": n_workers, **kwargs})  # type: ignore[arg-type]
 
 
@@ -284,7 +286,9 @@ def test_it_is_a_vec_env() -> None:
     env.close()
 
 
-@pytest.mark.parametrize(("n_envs", "n_workers", "sizes"), [(4, 2, [2, 2]), (5, 2, [3, 2]), (7, 3, [3, 2, 2]), (3, 3, [1, 1, 1])])
+@pytest.mark.parametrize(
+    ("n_envs", "n_workers", "sizes"), [(4, 2, [2, 2]), (5, 2, [3, 2]), (7, 3, [3, 2, 2]), (3, 3, [1, 1, 1])]
+)
 def test_the_first_workers_have_one_more(n_envs: int, n_workers: int, sizes: list[int]) -> None:
     parts = parts_of(range(n_envs), n_workers)
     assert [len(part) for part in parts] == sizes

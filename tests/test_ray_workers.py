@@ -107,7 +107,9 @@ def test_a_worker_killed_in_the_middle_of_its_share_changes_nothing(workers: Vec
 def test_what_the_last_batch_took_is_known(workers: Any, expected: dict[str, Any]) -> None:
     record = workers.last_collection
     assert 16 * 0.01 <= record.worker_seconds <= record.seconds
-    n_weights = sum(np.asarray(value).size for name, value in expected.items() if name.startswith(("mlp_extractor", "action", "value")))
+    n_weights = sum(
+        np.asarray(value).size for name, value in expected.items() if name.startswith(("mlp_extractor", "action", "value"))
+    )
     assert record.weights_bytes >= 4 * n_weights
     # Observations, actions and rewards in single precision, two flags
     assert record.shares_bytes == STEPS * (3 * 4 + 2 * 4 + 4 + 2) + 2 * 3 * 4

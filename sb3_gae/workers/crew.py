@@ -163,8 +163,8 @@ class Crew:
     def _no_place(self, n_missing: int, seconds: float) -> str:
         cpus = [resources().get("CPU", 0) for resources in (self._ray.available_resources, self._ray.cluster_resources)]
         return (
-            f"{n_missing} of {len(self)} workers of {self._cpus_per_worker} CPU each have not started in {seconds:.0f} s; Ray has "
-            f"{cpus[0]:g} of {cpus[1]:g} CPUs free. If it has no place for them, add machines or use fewer workers."
+            f"{n_missing} of {len(self)} workers of {self._cpus_per_worker} CPU each have not started in {seconds:.0f} s; "
+            f"Ray has {cpus[0]:g} of {cpus[1]:g} CPUs free. If it has no place for them, add machines or use fewer workers."
         )
 
 

@@ -211,8 +211,8 @@ class RayVecEnv(VecEnv):
         """
         if len(states) != self.n_workers:
             raise ValueError(
-                f"`n_workers` must be that of the checkpoint, {len(states)}, but is {self.n_workers}: other workers draw other "
-                "random numbers."
+                f"`n_workers` must be that of the checkpoint, {len(states)}, but is {self.n_workers}: other workers draw "
+                "other random numbers."
             )
         self._crew.ask("go_on_from", [(state,) for state in states])
         self._states = list(states)
