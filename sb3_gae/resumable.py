@@ -115,7 +115,7 @@ class ResumableModel(SavedModel):
             try:
                 return super().learn(*args, **kwargs)  # type: ignore[safe-super]
             except WorkersLostError as error:
-                advice = "There is no checkpoint, as there was no ResumableCheckpointCallback."
+                advice = "No checkpoint was written; ResumableCheckpointCallback would have."
                 raise WorkersLostError(f"{error} {self._rescue() if self._rescue else advice}") from error
 
     def _excluded_save_params(self) -> list[str]:

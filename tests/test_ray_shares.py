@@ -107,7 +107,7 @@ def test_workers_draw_different_numbers_and_environments_have_the_seeds_of_one_p
     assert not np.isclose(actions[:, 0], actions[:, 1]).any()
 
 
-@pytest.mark.parametrize("lost", [("collect", 1), ("collect", 0), ("reset", 1)])
+@pytest.mark.parametrize("lost", [("collect", 1), ("collect", 0), ("reset", 1), ("ask", 1)])
 @pytest.mark.parametrize("settings", [{}, {"n_episodes": 1, "n_steps": 60}])
 def test_a_lost_share_is_collected_again_and_nothing_else_changes(lost: tuple[str, int], settings: dict[str, Any]) -> None:
     class Lose(BaseCallback):
@@ -117,6 +117,7 @@ def test_a_lost_share_is_collected_again_and_nothing_else_changes(lost: tuple[st
         def _on_rollout_end(self) -> None:
             if self.num_timesteps <= STEPS:
                 LocalCrew.to_lose.add(lost)
+            self.training_env.get_attr("spec")
 
     expected = trained(VecNormalize(on_workers()), **settings)
     assert differences(expected, trained(VecNormalize(on_workers()), Lose(), **settings)) == []
@@ -173,7 +174,7 @@ def test_without_ray_the_training_ends_with_a_checkpoint_and_goes_on_from_it(tmp
 
 def test_without_a_callback_the_error_says_that_there_is_no_checkpoint() -> None:
     LocalCrew.gone.add("collect")
-    with pytest.raises(WorkersLostError, match="There is no checkpoint"):
+    with pytest.raises(WorkersLostError, match="No checkpoint was written"):
         trained(on_workers())
 
 

@@ -23,8 +23,15 @@ ray = pytest.importorskip("ray", reason='Ray is not installed: pip install "sb3-
 STEPS = 2 * 16
 
 
-def start_ray() -> None:
-    ray.init(num_cpus=2, include_dashboard=False, _node_ip_address="127.0.0.1", object_store_memory=80 * 2**20)
+def start_ray(attempts: int = 4) -> None:
+    """Ray gives its processes half a minute to start, which a busy machine may not have."""
+    try:
+        ray.init(num_cpus=4, include_dashboard=False, _node_ip_address="127.0.0.1", object_store_memory=80 * 2**20)
+    except Exception as error:
+        ray.shutdown()
+        if attempts == 1 or "timed out during startup" not in str(error):
+            raise
+        start_ray(attempts - 1)
 
 
 @pytest.fixture(scope="module", autouse=True)

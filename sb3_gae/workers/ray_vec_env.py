@@ -133,7 +133,8 @@ class RayVecEnv(VecEnv):
         """
         wrappers = wrappers_around(env)
         normalize = normalizer_of(wrappers)
-        shares = self._collect_shares(policy, plan, wrappers_to_send(wrappers), normalize is not None)
+        with_moments = normalize is not None and normalize.training and normalize.norm_obs
+        shares = self._collect_shares(policy, plan, wrappers_to_send(wrappers), with_moments)
         rewards = [share.rewards if normalize is None else normalize.normalize_reward(share.rewards) for share in shares]
         yield from batch_steps(policy, shares, rewards)
         if normalize is not None:
@@ -174,7 +175,7 @@ class RayVecEnv(VecEnv):
     def _send_policy(self, policy: ActorCriticPolicy) -> None:
         if policy is not self._policy:
             self._policy_content = portable_policy(policy)
-            self._crew.ask("take_policy", [(self._policy_content,)] * self.n_workers)
+            self._ask("take_policy", [(self._policy_content,)] * self.n_workers)
             self._policy = policy
 
     def _go_on_where_it_stood(self, worker: int) -> None:
@@ -221,7 +222,7 @@ class RayVecEnv(VecEnv):
         self._crew.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        return [image for part in self._crew.ask("ask", [("get_images", (), {})] * self.n_workers) for image in part]
+        return [image for part in self._ask("ask", [("get_images", (), {})] * self.n_workers) for image in part]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         return self._ask_those(indices, "get_attr", attr_name)
@@ -239,6 +240,11 @@ class RayVecEnv(VecEnv):
     def env_is_wrapped(self, wrapper_class: type[gym.Wrapper], indices: VecEnvIndices = None) -> list[bool]:
         return self._ask_those(indices, "env_is_wrapped", wrapper_class)
 
+    def _ask(self, method: str, arguments: Sequence[tuple[Any, ...]], workers: Sequence[int] | None = None) -> list[Any]:
+        """Replace a worker that was lost since the last batch, if it is known where it stood."""
+        replaced = None if self._states is None else self._go_on_where_it_stood
+        return self._crew.ask(method, arguments, replaced=replaced, workers=workers)
+
     @property
     def _slices(self) -> list[slice]:
         return [slice(start, end) for start, end in itertools.pairwise(self._borders)]
@@ -250,7 +256,7 @@ class RayVecEnv(VecEnv):
         workers = np.unique(worker_of).tolist()
         places = [np.flatnonzero(worker_of == worker).tolist() for worker in workers]
         local = [[chosen[place] - self._borders[worker] for place in own] for worker, own in zip(workers, places, strict=True)]
-        parts = self._crew.ask("ask", [(method, args, kwargs | {"indices": own}) for own in local], workers=workers)
+        parts = self._ask("ask", [(method, args, kwargs | {"indices": own}) for own in local], workers=workers)
         answers: list[Any] = [None] * len(chosen)
         for own, part in zip(places, parts, strict=True):
             for place, answer in zip(own, part or [None] * len(own), strict=True):
