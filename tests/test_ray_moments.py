@@ -22,9 +22,9 @@ def test_merging_parts_gives_the_statistics_of_the_whole(sizes: list[int], seed:
     for part in parts[1:]:
         merged = merged.merged(Moments.of(part))
     exact = whole.astype(np.longdouble)
-    assert merged.count == len(whole)
+    assert merged.n_rows == len(whole)
     np.testing.assert_allclose(merged.mean, exact.mean(axis=0).astype(float), rtol=1e-14, atol=1e-14)
-    np.testing.assert_allclose(merged.squares / merged.count, exact.var(axis=0).astype(float), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(merged.squares / merged.n_rows, exact.var(axis=0).astype(float), rtol=1e-9, atol=1e-12)
 
 
 def test_rows_that_come_a_few_at_a_time_are_all_counted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,7 +34,7 @@ def test_rows_that_come_a_few_at_a_time_are_all_counted(monkeypatch: pytest.Monk
     for start in range(0, 47, 4):
         running.add(rows[start : start + 4])
     whole = Moments.of(rows)
-    assert running.total().count == 47
+    assert running.total().n_rows == 47
     np.testing.assert_allclose(running.total().mean, whole.mean, rtol=1e-13)
     np.testing.assert_allclose(running.total().squares, whole.squares, rtol=1e-13)
 

@@ -39,7 +39,7 @@ class Crew:
         self._cpus_per_worker = cpus_per_worker
         self._gcs_address = str(self._ray.get_runtime_context().gcs_address)
         # Spread, so that a cluster of many small machines is used as evenly as one large one
-        self._actor_class = self._ray.remote(RolloutWorker).options(  # type: ignore[attr-defined]
+        self._actor_class = self._ray.remote(RolloutWorker).options(
             num_cpus=cpus_per_worker, scheduling_strategy="SPREAD", max_restarts=0, max_task_retries=0
         )
         self._actors = [self._new_actor(index, is_replacement=False) for index in range(len(makers))]
@@ -111,7 +111,7 @@ class Crew:
 
     def close(self) -> None:
         """End all workers. Ray itself stays, as it may serve others."""
-        if self._ray.is_initialized():
+        if self._is_the_same_ray():
             for actor in self._actors:
                 self._ray.kill(actor)
         self._actors = []
@@ -149,9 +149,12 @@ class Crew:
             exceptions.OutOfMemoryError,
         )
 
+    def _is_the_same_ray(self) -> bool:
+        return self._ray.is_initialized() and self._ray.get_runtime_context().gcs_address == self._gcs_address
+
     def _check_ray(self) -> None:
         """Ray itself would start another one, or end this process a minute after it lost its cluster."""
-        if not self._ray.is_initialized():
+        if not self._is_the_same_ray():
             raise WorkersLostError("Ray has been shut down, and the workers with it.")
         host, _, port = self._gcs_address.rpartition(":")
         try:

@@ -11,12 +11,12 @@ _BLOCK = 4_096
 
 class Moments(NamedTuple):
     """
-    :param count: number of rows
+    :param n_rows: number of rows
     :param mean: over the rows, in float64
     :param squares: sum over the rows of the squared differences from the mean, in float64
     """
 
-    count: int
+    n_rows: int
     mean: np.ndarray
     squares: np.ndarray
 
@@ -37,17 +37,17 @@ class Moments(NamedTuple):
         :param other: of other rows
         :return: moments of all
         """
-        count = self.count + other.count
+        n_rows = self.n_rows + other.n_rows
         delta = other.mean - self.mean
-        mean = self.mean + delta * (other.count / count)
-        squares = self.squares + other.squares + np.square(delta) * (self.count * other.count / count)
-        return Moments(count, mean, squares)
+        mean = self.mean + delta * (other.n_rows / n_rows)
+        squares = self.squares + other.squares + np.square(delta) * (self.n_rows * other.n_rows / n_rows)
+        return Moments(n_rows, mean, squares)
 
     def add_to(self, statistics: RunningMeanStd) -> None:
         """
         :param statistics: of ``VecNormalize``, which then know these rows as well
         """
-        statistics.update_from_moments(self.mean, self.squares / self.count, self.count)
+        statistics.update_from_moments(self.mean, self.squares / self.n_rows, self.n_rows)
 
 
 class RunningMoments:

@@ -72,7 +72,7 @@ class RayVecEnv(VecEnv):
         self,
         env_fns: Sequence[Callable[[], gym.Env]],
         n_workers: int,
-        vec_env_cls: Callable[[Sequence[Callable[[], gym.Env]]], VecEnv] | None = None,
+        vec_env_cls: Callable[..., VecEnv] | None = None,
         cpus_per_worker: int = 1,
     ):
         check_count("n_workers", n_workers)

@@ -147,7 +147,7 @@ def batch_steps(policy: ActorCriticPolicy, shares: Sequence[Share], rewards: Seq
 
 def _stacked(observations: list[Observations]) -> Observations:
     if isinstance(first := observations[0], dict):
-        return {key: np.stack([part[key] for part in observations]) for key in first}  # type: ignore[call-overload]
+        return {key: np.stack([part[key] for part in observations]) for key in first}
     return np.stack(observations)  # type: ignore[arg-type]
 
 
@@ -157,13 +157,13 @@ def joined(observations: Sequence[Observations]) -> Observations:
     :return: of all, in their order
     """
     if isinstance(first := observations[0], dict):
-        return {key: np.concatenate([part[key] for part in observations]) for key in first}  # type: ignore[call-overload]
+        return {key: np.concatenate([part[key] for part in observations]) for key in first}
     return np.concatenate(observations)  # type: ignore[arg-type]
 
 
 def _side_by_side(observations: list[Observations], n_steps: int) -> Observations:
     if isinstance(first := observations[0], dict):
-        return {key: _padded_side_by_side([part[key] for part in observations], n_steps) for key in first}  # type: ignore[call-overload]
+        return {key: _padded_side_by_side([part[key] for part in observations], n_steps) for key in first}
     return _padded_side_by_side(observations, n_steps)  # type: ignore[arg-type]
 
 
