@@ -111,7 +111,7 @@ def speed(gigabits: float | None, arguments: Sequence[str]) -> int:
     out = ["--out", str(HERE / "results" / "ray_hosts.csv")]
     with hosts(2, gigabits) as names:
         command = [sys.executable, str(HERE / "ray_speed.py"), "--address", ADDRESS, *out, *arguments]
-        return on_cluster(names, [1, 1], command).wait()
+        return on_cluster(names, [2, 2], command).wait()
 
 
 def loss() -> int:

@@ -24,6 +24,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple
 
+import ray
 import torch as th
 from rollout_speed import Learner, make_learner
 from sb3_contrib import TRPO
@@ -146,8 +147,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--smoke", action="store_true", help="tiny, and nothing is written")
     args = parser.parse_args()
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if args.address:
         os.environ["RAY_ADDRESS"] = args.address
+    else:
+        # A place for the workers of all ways, which are there at once and at work in turn
+        ray.init(num_cpus=sum(args.workers), include_dashboard=False)
     warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
     print(f"Python {sys.version.split()[0]}, torch {th.__version__}, {th.get_num_threads()} threads")
     rows: list[dict[str, Any]] = []
