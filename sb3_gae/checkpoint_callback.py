@@ -30,7 +30,8 @@ class ResumableCheckpointCallback(BaseCallback):
     Saves checkpoints from which :meth:`TRPOGAE.resume` goes on bit for bit.
 
     Between two iterations, when ``save_freq`` calls of ``env.step()`` or more have been made since the last one, and at the
-    beginning and the end of training (unless another callback ends it in the middle of an iteration). SIGTERM and
+    beginning and the end of training (unless another callback ends it in the middle of an iteration), and where Ray workers
+    were lost for good. SIGTERM and
     Ctrl-C are kept until the next iteration begins, and then do what they always do, after a checkpoint and a message that
     says how to continue; the second one counts at once.
 
@@ -87,6 +88,7 @@ class ResumableCheckpointCallback(BaseCallback):
             if is_whole(self._path):
                 # What was resumed from
                 self._next_save, self._last_saved = self.n_calls + self.save_freq, self.model.num_timesteps
+        self._resumable.when_workers_are_lost(self._save_what_is_left)
         if self.handle_signals:
             self._signals.install()
             self._resumable.when_learning_ends(self._signals.restore)
@@ -138,6 +140,13 @@ class ResumableCheckpointCallback(BaseCallback):
         self._last_saved = self.model.num_timesteps
         if self.verbose >= 1:
             print(f"Saving checkpoint to {path}")
+
+    def _save_what_is_left(self) -> str:
+        self._save()
+        if not is_whole(self._path):
+            return "No checkpoint could be written."
+        kind = type(self.model).__name__
+        return f"Make environments anew, and continue with {kind}.resume({str(self._path)!r}, env)."
 
     def _delete_old(self) -> None:
         """Only what is ours, and none that is needed in the place of a damaged one."""

@@ -1,17 +1,20 @@
-"""Pieces of the collection of a rollout: actions of a step, endings of a step, values of the whole, and what to train on."""
+"""Pieces of the collection of a rollout: its steps, endings of a step, values of the whole, and what to train on."""
 
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gae.advantages import discounted_returns
 from sb3_gae.batch import TrainingBatch, as_float, in_chunks
 from sb3_gae.checks import check_finite_rollout, check_finite_step
 from sb3_gae.dense_policy import gaussian_layers
+from sb3_gae.episode_quota import EpisodeQuota
 from sb3_gae.errors import NumericalError
 from sb3_gae.rollout_buffer import GAERolloutBuffer
 
@@ -42,6 +45,60 @@ class RolloutEnd(NamedTuple):
     terminal: list[TerminalObservation]
     observations: Observations
     dones: np.ndarray
+
+
+class RolloutPlan(NamedTuple):
+    """
+    :param n_steps: the most that each environment takes
+    :param n_episodes: that each environment finishes; None for all the steps
+    :param use_sde: whether the policy explores by gSDE
+    :param sde_sample_freq: steps from one noise matrix to the next; -1 for one at the beginning alone
+    """
+
+    n_steps: int
+    n_episodes: int | None = None
+    use_sde: bool = False
+    sde_sample_freq: int = -1
+
+
+class Step(NamedTuple):
+    """
+    One step of all environments.
+
+    :param observations: what the actions were chosen on, shape (N, ...), or a dictionary of such
+    :param episode_starts: whether it was the first step of its episode, shape (N,)
+    :param actions: as the distribution gave them, in the shape of the action space, (N, ...)
+    :param clipped_actions: as the environments took them
+    :param new_observations: what followed, the first ones of new episodes where one ended
+    :param rewards: shape (N,)
+    :param dones: whether it was the last step of its episode, shape (N,)
+    :param infos: of each environment
+    :param n_taken: number of environments that took the step
+    """
+
+    observations: Observations
+    episode_starts: np.ndarray
+    actions: np.ndarray
+    clipped_actions: np.ndarray
+    new_observations: Observations
+    rewards: np.ndarray
+    dones: np.ndarray
+    infos: list[dict[str, Any]]
+    n_taken: int
+
+
+@runtime_checkable
+class CollectsRollouts(Protocol):
+    """Environments that take the steps of a whole rollout by themselves, such as those on Ray workers."""
+
+    def collect_rollout(self, policy: ActorCriticPolicy, env: VecEnv, plan: RolloutPlan) -> Iterator[Step]:
+        """
+        :param policy: in evaluation mode
+        :param env: these environments in their wrappers
+        :param plan: how many steps to take
+        :return: the steps as they would have been taken one by one; those of an environment that has finished its episodes
+            before others are empty and end no episode
+        """
 
 
 class ActionSampler:
@@ -95,6 +152,47 @@ def environment_actions(policy: ActorCriticPolicy, actions: np.ndarray) -> np.nd
     if not isinstance(space, spaces.Box):
         return actions
     return policy.unscale_action(actions) if policy.squash_output else np.clip(actions, space.low, space.high)
+
+
+def take_steps(
+    policy: ActorCriticPolicy,
+    env: VecEnv,
+    observations: Observations,
+    episode_starts: np.ndarray,
+    plan: RolloutPlan,
+    quota: EpisodeQuota,
+    first_env: int = 0,
+) -> Iterator[Step]:
+    """
+    The steps of a rollout, each taken when it is asked for.
+
+    :param policy: in evaluation mode
+    :param env: to step
+    :param observations: of the environments as they stand, shape (N, ...), or a dictionary of such
+    :param episode_starts: whether they stand at the beginning of an episode, shape (N,)
+    :param plan: how many steps to take
+    :param quota: whoever takes the steps adds the endings; the last step is the one that meets it
+    :param first_env: number of the first environment, for messages
+    :raises NumericalError: if an observation, action or reward is not finite
+    """
+    if plan.use_sde:
+        policy.reset_noise(env.num_envs)
+    sample = ActionSampler(policy)
+    for step in range(plan.n_steps):
+        if quota.is_met:
+            return
+        if plan.use_sde and plan.sde_sample_freq > 0 and step % plan.sde_sample_freq == 0:
+            policy.reset_noise(env.num_envs)
+        actions = sample(observations, step)
+        clipped_actions = environment_actions(policy, actions)
+        result = env.step(clipped_actions)
+        new_observations, (_, rewards, dones, infos) = cast(Observations, result[0]), result
+        check_finite_step("reward", rewards, step, first_env)
+        check_finite_step("observation", new_observations, step + 1, first_env)
+        yield Step(
+            observations, episode_starts, actions, clipped_actions, new_observations, rewards, dones, infos, env.num_envs
+        )
+        observations, episode_starts = new_observations, dones
 
 
 def terminal_observations(step: int, dones: np.ndarray, infos: list[dict[str, Any]]) -> list[TerminalObservation]:

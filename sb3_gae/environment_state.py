@@ -2,7 +2,8 @@
 The state of environments, so that a later process can go on where this one stopped.
 
 An environment, a wrapper or a ``VecEnv`` with the methods ``state_dict`` and ``load_state_dict`` says itself what its
-state is, apart from what it wraps. Of all others in a ``DummyVecEnv`` the attributes are taken, if they can be pickled.
+state is, apart from what it wraps, or gives None if it cannot. Of all others in a ``DummyVecEnv`` the attributes are taken,
+if they can be pickled.
 """
 
 import io
@@ -117,6 +118,8 @@ def _pickled_together(inner: list[Any], layers: list[Any]) -> bytes | None:
     states = []
     for layer in inner:
         own = layer.state_dict() if _speaks_for_itself(layer) else None
+        if own is None and _speaks_for_itself(layer):
+            return None
         if isinstance(layer, VecEnv):
             attributes = {name: vars(layer)[name] for name in _OF_VEC_ENVS}
         else:

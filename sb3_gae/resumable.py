@@ -13,6 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_gae.checkpoint_file import newest_checkpoint, state_in
 from sb3_gae.environment_state import restore_environment
+from sb3_gae.errors import WorkersLostError
 from sb3_gae.random_state import restore_random_state
 from sb3_gae.saved_model import SavedModel
 from sb3_gae.training_state import seed_of_continuation
@@ -22,9 +23,10 @@ class ResumableModel(SavedModel):
     """To be inherited before an algorithm of SB3."""
 
     #: names of attributes that no file keeps
-    _of_the_process: ClassVar[tuple[str, ...]] = ("_end_of_learning", "_resumed", "learn")
+    _of_the_process: ClassVar[tuple[str, ...]] = ("_end_of_learning", "_rescue", "_resumed", "learn")
 
     _end_of_learning: ExitStack | None = None
+    _rescue: Callable[[], str] | None = None
     _resumed: dict[str, Any] | None = None
 
     @classmethod
@@ -100,9 +102,21 @@ class ResumableModel(SavedModel):
         assert self._end_of_learning is not None, "nothing is being learnt"
         self._end_of_learning.callback(clean_up)
 
+    def when_workers_are_lost(self, rescue: Callable[[], str]) -> None:
+        """
+        :param rescue: called if the present ``learn`` ends because workers are lost. The model is then as it was at the
+            beginning of the iteration. Returns a sentence that says how to go on
+        """
+        self._rescue = rescue
+
     def learn(self, *args: Any, **kwargs: Any) -> Self:
+        self._rescue = None
         with ExitStack() as self._end_of_learning:
-            return super().learn(*args, **kwargs)  # type: ignore[safe-super]
+            try:
+                return super().learn(*args, **kwargs)  # type: ignore[safe-super]
+            except WorkersLostError as error:
+                advice = "No checkpoint was written; ResumableCheckpointCallback would have."
+                raise WorkersLostError(f"{error} {self._rescue() if self._rescue else advice}") from error
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *self._of_the_process]

@@ -3,7 +3,7 @@
 import io
 import pathlib
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, ClassVar, Self, cast
 
 import numpy as np
@@ -21,13 +21,15 @@ from sb3_gae.all_or_nothing import all_or_nothing
 from sb3_gae.batch import TrainingBatch, random_subset, standardized
 from sb3_gae.checks import check_finite_parameters, check_finite_rollout, check_finite_step
 from sb3_gae.collection import (
-    ActionSampler,
+    CollectsRollouts,
     Observations,
     RolloutEnd,
+    RolloutPlan,
+    Step,
     TerminalObservation,
-    environment_actions,
     evaluate_rollout,
     reward_returns,
+    take_steps,
     terminal_observations,
     training_batch,
 )
@@ -46,6 +48,7 @@ from sb3_gae.trust_region import StepRecord, TrustRegionSettings
 from sb3_gae.update_summary import update_summary
 from sb3_gae.value_head import ValueHead
 from sb3_gae.value_step import ValueFitRecord, value_parameters, value_steps
+from sb3_gae.workers.ray_vec_env import env_on_workers
 
 
 class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
@@ -114,6 +117,9 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         With the latter there is no value fit, and ``gae_lambda`` and ``value_lambda`` have no effect
     :param value_fit_first: whether to fit the value function before the policy step and compute the advantages anew, the
         order that the paper warns of (section 5); for comparison
+    :param rollout_workers: number of Ray workers that collect the batch, each its share, see
+        :class:`~sb3_gae.RayVecEnv`. ``env`` is then an id, a function that makes an environment or a ``VecEnv``, of which each
+        worker has one, or a :class:`~sb3_gae.RayVecEnv`. None to collect in this process
     :param foreign_arguments: arguments of PPO and A2C that have no meaning here; each warns and says what to use
     :raises ValueError: if an argument is outside its domain
     :raises TypeError: if an argument is unknown, or the rollout buffer is of another kind
@@ -130,7 +136,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
     def __init__(
         self,
         policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
+        env: GymEnv | str | Callable[[], GymEnv],
         learning_rate: float | Schedule | None = None,
         n_steps: int = 2048,
         batch_size: int | None = None,
@@ -169,11 +175,14 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         n_episodes: int | None = None,
         baseline: str = "value",
         value_fit_first: bool = False,
+        rollout_workers: int | None = None,
         **foreign_arguments: Any,
     ):
+        if rollout_workers is not None:
+            env = env_on_workers(env, rollout_workers)
         super().__init__(
             policy,
-            env,
+            cast(GymEnv | str, env),
             learning_rate=1e-3 if learning_rate is None else learning_rate,
             n_steps=n_steps,
             gamma=gamma,
@@ -261,8 +270,6 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         check_finite_step("observation", self._last_obs, 0)
         self.policy.set_training_mode(False)
         rollout_buffer.reset()
-        if self.use_sde:
-            self.policy.reset_noise(env.num_envs)
         with threads_for_steps(self.policy, env.num_envs):
             terminal = self._collect_steps(env, callback, rollout_buffer, n_rollout_steps, quota)
         if terminal is None:
@@ -289,20 +296,11 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         quota: EpisodeQuota,
     ) -> list[TerminalObservation] | None:
         """Take the steps of a rollout, and return where time limits struck; nothing if the callback ended training."""
-        assert self._last_obs is not None and self._last_episode_starts is not None
-        sample = ActionSampler(self.policy)
         terminal: list[TerminalObservation] = []
-        n_steps = 0
-        while n_steps < n_rollout_steps and not quota.is_met:
-            if self.use_sde and self.sde_sample_freq > 0 and n_steps % self.sde_sample_freq == 0:
-                self.policy.reset_noise(env.num_envs)
-            actions = sample(self._last_obs, n_steps)
-            clipped_actions = environment_actions(self.policy, actions)
-            new_obs, rewards, dones, infos = env.step(clipped_actions)
-            check_finite_step("reward", rewards, n_steps)
-            check_finite_step("observation", cast(Observations, new_obs), n_steps + 1)
-
-            self.num_timesteps += env.num_envs
+        for n_steps, step in enumerate(self._steps(env, n_rollout_steps, quota)):
+            actions, clipped_actions, new_obs = step.actions, step.clipped_actions, step.new_observations
+            rewards, dones, infos = step.rewards, step.dones, step.infos
+            self.num_timesteps += step.n_taken
             callback.update_locals(locals())
             if not callback.on_step():
                 return None
@@ -313,14 +311,22 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
                 endings = self._record_endings(n_steps, dones, dones if counts is None else dones & counts, infos)
                 terminal.extend(endings)
                 truncated[[ending.env for ending in endings]] = True
-            rollout_buffer.add_step(self._last_obs, actions, rewards, self._last_episode_starts, dones, truncated, counts)
+            rollout_buffer.add_step(step.observations, actions, rewards, step.episode_starts, dones, truncated, counts)
             quota.add(dones)
-            n_steps += 1
-            self._last_obs = cast(Observations, new_obs)
+            self._last_obs = new_obs
             self._last_episode_starts = dones
         # For the end of the rollout, when the number of steps is one more
+        n_steps = rollout_buffer.pos
         callback.update_locals(locals())
         return terminal
+
+    def _steps(self, env: VecEnv, n_rollout_steps: int, quota: EpisodeQuota) -> Iterator[Step]:
+        """Taken here, or collected by environments that do so themselves."""
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        plan = RolloutPlan(n_rollout_steps, self.n_episodes, self.use_sde, self.sde_sample_freq)
+        if isinstance(base := env.unwrapped, CollectsRollouts):
+            return base.collect_rollout(self.policy, env, plan)
+        return take_steps(self.policy, env, self._last_obs, self._last_episode_starts, plan, quota)
 
     def _record_endings(
         self, step: int, dones: np.ndarray, counted: np.ndarray, infos: list[dict[str, Any]]

@@ -140,7 +140,7 @@ def _add_default_hyperparams(exp_manager: ModuleType) -> None:
         original(*bound.args, **bound.kwargs)
 
     manager.__init__ = _mark_as_ours(init_with_our_default)
-    add_keys(manager)
+    add_keys(manager, ALGO)
     add_resuming(manager, TRPOGAE, ALGO)
 
 

@@ -11,12 +11,13 @@ import gymnasium as gym
 import pytest
 import rl_zoo3.train
 import yaml
+from local_crew import LocalCrew
 from rl_zoo3.exp_manager import ExperimentManager
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.monitor import Monitor, load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize, is_vecenv_wrapped
 
-from sb3_gae import EnvPoolVecEnv, MujocoVecEnv, SharedMlpPolicy, zoo
+from sb3_gae import EnvPoolVecEnv, MujocoVecEnv, RayVecEnv, SharedMlpPolicy, zoo
 
 TASK, ORDINARY = "GaeCartPole-v0", "CartPole-v1"
 SETTINGS = {"n_timesteps": 64, "policy": "MlpPolicy", "n_envs": 2, "n_steps": 16, "policy_kwargs": "dict(net_arch=[8])"}
@@ -111,6 +112,43 @@ def test_whoever_asks_for_subprocesses_gets_them(tmp_path: Path, monkeypatch: py
 
 def test_ordinary_environments_are_made_as_ever(tmp_path: Path) -> None:
     assert kinds(manager(tmp_path, ORDINARY, batched_envs=True)) == (DummyVecEnv, DummyVecEnv)
+
+
+@pytest.mark.parametrize("in_file", [True, False])
+@pytest.mark.parametrize(("batched", "of_worker"), [(True, MujocoVecEnv), (False, DummyVecEnv)])
+def test_workers_have_the_environments_to_train_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_file: bool, batched: bool, of_worker: type
+) -> None:
+    monkeypatch.setattr("sb3_gae.workers.ray_vec_env.Crew", LocalCrew)
+    key = {"rollout_workers": 2}
+    experiment = manager(tmp_path, batched_envs=batched, normalize=True, **(key if in_file else {"hyperparams": key}))
+    model, eval_env = set_up(experiment)
+    base = model.get_env().unwrapped
+    assert type(base) is RayVecEnv and type(eval_env) is DummyVecEnv
+    assert [type(worker._env) for worker in base._crew._workers] == [of_worker] * 2
+    experiment.learn(model)
+    assert model.num_timesteps == 64
+    assert len(list(Path(experiment.save_path).glob("*.monitor.csv"))) == 2
+
+
+@pytest.mark.parametrize("value", [0, "two", True])
+def test_a_number_of_workers_that_is_none_is_refused(tmp_path: Path, value: Any) -> None:
+    with pytest.raises(ValueError, match="`rollout_workers` must be a whole number of at least 1"):
+        manager(tmp_path, rollout_workers=value).setup_experiment()
+
+
+def test_workers_and_subprocesses_are_not_for_the_same_environments(tmp_path: Path) -> None:
+    experiment = manager(tmp_path, rollout_workers=2)
+    experiment.vec_env_class = SubprocVecEnv
+    with pytest.raises(ValueError, match="leave out one of them"):
+        experiment.setup_experiment()
+
+
+def test_algorithms_that_take_each_step_themselves_have_no_workers(tmp_path: Path) -> None:
+    experiment = manager(tmp_path, rollout_workers=2)
+    experiment.algo = "ppo"
+    with pytest.raises(ValueError, match="`rollout_workers` is for trpo_gae; ppo takes each step itself"):
+        experiment.setup_experiment()
 
 
 def test_a_wrapper_that_must_see_each_step_turns_batches_off(tmp_path: Path) -> None:
