@@ -27,10 +27,12 @@ class LambdaRule(Protocol):
     r"""
     A source of :math:`\lambda`. What it learns from one batch it applies to the next, so that no batch chooses its own.
 
-    ``target_lambda`` is for the value targets where the user says nothing of them, None for that of the advantages.
+    ``target_lambda`` is for the value targets where the user says nothing of them, None for that of the advantages. It is read
+    after :meth:`value`.
     """
 
-    target_lambda: float | None
+    @property
+    def target_lambda(self) -> float | None: ...
 
     def value(self, progress_remaining: float) -> float:
         """
@@ -111,8 +113,9 @@ class MeasuredLambda:
         :func:`~sb3_gae.rollout_diagnostics.expected_improvement`, ``"squared_error"`` for the least bias squared and variance
     :param metric: of the gradients, ``"fisher"`` or ``"euclidean"``. Policies that are no MLP as SB3 builds it have
         the latter in any case
-    :param target_lambda: :math:`\lambda` of the value targets where ``value_lambda`` is None. What is measured is of the
-        policy gradient, and says nothing of what the value function should be fitted to; None to follow it all the same
+    :param largest_target_lambda: what :math:`\lambda` of the value targets is at most where ``value_lambda`` is None; below,
+        it is that of the advantages. What is measured is of the policy gradient, and where that is best with long sums, this
+        says nothing of the noise that the value function should be fitted to
     :raises ValueError: if the grid is no ascending list in [0, 1] that ends with 1, or a name is unknown
     """
 
@@ -124,28 +127,33 @@ class MeasuredLambda:
         patience: int = 5,
         criterion: str = "improvement",
         metric: str = "fisher",
-        target_lambda: float | None = 0.96,
+        largest_target_lambda: float = 0.96,
     ):
         check_unit_interval("lambdas", lambdas)
         if lambdas[-1] != 1.0 or not np.all(np.diff(lambdas) > 0):
             raise ValueError(f"`lambdas` must ascend and end with 1, got {lambdas!r}.")
         check_choice("criterion", criterion, CRITERIA)
         check_choice("metric", metric, METRICS)
-        if target_lambda is not None:
-            check_number("target_lambda", target_lambda, 0.0, 1.0)
+        check_number("largest_target_lambda", largest_target_lambda, 0.0, 1.0)
         self.lambdas = tuple(lambdas)
         self.memory = memory
         self.patience = patience
         self.criterion = criterion
         self.metric = metric
-        self.target_lambda = target_lambda
+        self.largest_target_lambda = largest_target_lambda
         self.place = int(np.argmin(np.abs(np.subtract(lambdas, start))))
+        self._in_use = self.lambdas[self.place]
         self._sums = np.zeros((4, len(lambdas)))
         self._weight = 0.0
         self._n_batches = 0
 
     def value(self, progress_remaining: float) -> float:
-        return self.lambdas[self.place]
+        self._in_use = self.lambdas[self.place]
+        return self._in_use
+
+    @property
+    def target_lambda(self) -> float:
+        return min(self._in_use, self.largest_target_lambda)
 
     def learn_from(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> dict[str, float]:
         if not has_several_trajectories(rollout_buffer):

@@ -229,9 +229,10 @@ def test_networks_of_other_kinds_are_measured_in_the_euclidean_metric(monkeypatc
 @pytest.mark.parametrize(
     ("gae_lambda", "value_lambda", "expected"),
     [
-        (MeasuredLambda(start=0.68), None, 0.96),
-        (MeasuredLambda(start=0.68, target_lambda=0.5), None, 0.5),
-        (MeasuredLambda(start=0.68, target_lambda=None), None, 0.68),
+        (MeasuredLambda(start=0.68), None, 0.68),
+        (MeasuredLambda(start=0.99), None, 0.96),
+        (MeasuredLambda(start=0.68, largest_target_lambda=0.5), None, 0.5),
+        (MeasuredLambda(start=0.99, largest_target_lambda=1.0), None, 0.99),
         (MeasuredLambda(start=0.68), 0.3, 0.3),
         (lambda progress: 0.68, None, 0.68),
         ("explained_variance", None, 1.0),
@@ -247,8 +248,8 @@ def test_value_targets_have_a_lambda_of_their_own(gae_lambda: Any, value_lambda:
 
 
 def test_a_target_lambda_is_checked() -> None:
-    with pytest.raises(ValueError, match="`target_lambda` must be a number in"):
-        MeasuredLambda(target_lambda=1.1)
+    with pytest.raises(ValueError, match="`largest_target_lambda` must be a number in"):
+        MeasuredLambda(largest_target_lambda=1.1)
 
 
 def test_a_schedule_is_followed() -> None:
