@@ -45,7 +45,9 @@ def test_links_lead_somewhere(document: Path, link: str) -> None:
     assert (document.parent / link).exists()
 
 
-@pytest.mark.parametrize("sweep", ["fig2-left", "fig3-left", "value-targets-cart-pole"])
+@pytest.mark.parametrize(
+    "sweep", ["fig2-left", "fig3-left", "value-targets-cart-pole", "lambda-auto-HalfCheetah-v5", "lambda-auto-Hopper-v5"]
+)
 def test_tables_of_sweeps_are_what_the_command_prints(
     sweep: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
