@@ -4,8 +4,8 @@
 #   make test                      run the tests (fewer of them: ARGS="tests/test_zoo_hook.py -k spawn")
 #   make check                     formatting, lint, types
 #   make format                    put formatting right
-#   make bench                     some minutes that turn red when speed or learning get worse
-#   make bench-full                also speeds beside peers, what the shipped settings reach, and learning beside peers (days)
+#   make bench                     speed of an update beside sb3-contrib's
+#   make bench-full                also speed of whole iterations, what the shipped settings reach, and peers (days)
 #   make clean                     remove .venv and what builds and tools left
 #   make PYTHON=python3.12 train   choose an interpreter
 
@@ -61,10 +61,9 @@ format: $(STAMP)
 	$(IN_VENV) ruff check --fix .
 
 bench: $(STAMP)
-	$(IN_VENV) python -m benchmarks.gate $(ARGS)
+	$(IN_VENV) python benchmarks/update_speed.py $(ARGS)
 
 bench-full: bench $(TIANSHOU)/.installed
-	$(IN_VENV) python benchmarks/update_speed.py
 	$(IN_VENV) python benchmarks/rollout_speed.py
 	$(IN_VENV) python benchmarks/first_results.py
 	$(IN_VENV) python benchmarks/paper_tasks.py

@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.gate.bands import Band, verdicts
 from benchmarks.gate.learning import RUNS, SEEDS, learning_scores
 from benchmarks.gate.plants import PLANTS
-from benchmarks.gate.records import add_to_history, bands, read_records, write_records
+from benchmarks.gate.records import RECORDS, add_to_history, bands, read_records, write_records
 from benchmarks.gate.speed import speed_ratios
 from sb3_gae.sweep.provenance import provenance
 
@@ -83,10 +83,7 @@ def remember(part: str, measured: dict[str, float], limits: dict[str, Band]) -> 
 
 def record(parts: Sequence[str]) -> None:
     """Record what the bands are made from; learning with seeds that the gate itself does not use."""
-    try:
-        records = read_records()
-    except FileNotFoundError:
-        records = {}
+    records = read_records() if RECORDS.exists() else {}
     if "speed" in parts:
         rounds = [speed_ratios() for _ in range(RECORDED_ROUNDS)]
         records["speed"] = {name: [round(each[name], 4) for each in rounds] for name in rounds[0]}

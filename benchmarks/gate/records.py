@@ -18,8 +18,10 @@ HISTORY_COLUMNS = ("date", "commit", "part", "name", "value", "low", "high")
 def read_records() -> dict[str, Any]:
     """
     :return: ``{"learning": {name: {seed: score}}, "speed": {name: [ratio]}}``
-    :raises FileNotFoundError: if nothing was ever recorded
+    :raises SystemExit: if nothing was ever recorded
     """
+    if not RECORDS.exists():
+        raise SystemExit(f"There is no {RECORDS}; record what unchanged code does: python -m benchmarks.gate record")
     return json.loads(RECORDS.read_text())
 
 
