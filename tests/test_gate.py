@@ -63,5 +63,5 @@ def test_a_plant_does_the_work_two_times_and_goes_away() -> None:
 
 def test_without_a_record_the_gate_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("benchmarks.gate.records.RECORDS", tmp_path / "gate.json")
-    with pytest.raises(SystemExit, match="python -m benchmarks.gate record"):
+    with pytest.raises(SystemExit, match=r"python -m benchmarks\.gate record"):
         read_records()
