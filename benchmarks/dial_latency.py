@@ -96,6 +96,8 @@ def main(arguments: list[str]) -> int:
             until(browser, lambda dial=dial: track(browser, dial).is_displayed())
             report(f"{dial}, keyboard", by_keyboard(browser, dial, picture, n_moves))
             report(f"{dial}, drag", by_drag(browser, dial, picture, n_moves))
+            # With λ = 0 nothing that is sampled would depend on γ
+            track(browser, dial).send_keys(Keys.END)
     print(f"load of the machine after: {os.getloadavg()[0]:.1f}")
     return 0
 
