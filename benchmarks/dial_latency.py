@@ -28,10 +28,10 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 #: (tab, dial, the picture that changes with any change of it)
 DIALS = (
-    ("grid", "gae_lambda", "trace"),
-    ("grid", "gamma", "trace"),
     ("robot", "rollout_lambda", "trade-off"),
     ("robot", "rollout_gamma", "response"),
+    ("grid", "gae_lambda", "trace"),
+    ("grid", "gamma", "trace"),
 )
 #: steps of the run before the gridworld's dials are turned, so that its curves have something in them
 RUN = 40
@@ -92,6 +92,8 @@ def main(arguments: list[str]) -> int:
         for step in range(RUN):
             press(browser, "step", "step-count", f"step {step + 1}")
         for tab, dial, picture in DIALS:
+            # The dial before may have scrolled the tabs away
+            browser.execute_script("scrollTo(0, 0)")
             browser.find_element(By.CSS_SELECTOR, f"[data-test=tab-{tab}]").click()
             until(browser, lambda dial=dial: track(browser, dial).is_displayed())
             report(f"{dial}, keyboard", by_keyboard(browser, dial, picture, n_moves))
