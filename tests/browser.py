@@ -11,9 +11,23 @@ if CHROMIUM is None or DRIVER is None:
     pytest.skip("chromium and chromedriver are needed: apt install chromium chromium-driver", allow_module_level=True)
 
 from selenium import webdriver  # noqa: E402
+from selenium.common.exceptions import (  # noqa: E402
+    ElementClickInterceptedException,
+    StaleElementReferenceException,
+)
 from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 from selenium.webdriver.remote.webelement import WebElement  # noqa: E402
 from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
 
-__all__ = ["CHROMIUM", "DRIVER", "By", "Keys", "WebDriverWait", "WebElement", "webdriver"]
+__all__ = [
+    "CHROMIUM",
+    "DRIVER",
+    "By",
+    "ElementClickInterceptedException",
+    "Keys",
+    "StaleElementReferenceException",
+    "WebDriverWait",
+    "WebElement",
+    "webdriver",
+]

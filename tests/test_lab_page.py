@@ -9,7 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import CHROMIUM, DRIVER, By, Keys, WebDriverWait, WebElement, webdriver
+from browser import (
+    CHROMIUM,
+    DRIVER,
+    By,
+    ElementClickInterceptedException,
+    Keys,
+    StaleElementReferenceException,
+    WebDriverWait,
+    WebElement,
+    webdriver,
+)
 
 from sb3_gae.lab.export import recorded_run
 from sb3_gae.lab.presets import PRESETS, load_preset
@@ -77,9 +87,17 @@ def text(browser: webdriver.Chrome, marker: str) -> str:
 
 
 def press(browser: webdriver.Chrome, marker: str) -> None:
-    # A real click wherever the sticky bar does not cover the place
-    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", find(browser, marker))
-    find(browser, marker).click()
+    # A real click, and again where the page moved between the look and the click: text that
+    # arrives from the server can make the sticky bar a line higher just then
+    def clicked() -> bool:
+        browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", find(browser, marker))
+        try:
+            find(browser, marker).click()
+        except (ElementClickInterceptedException, StaleElementReferenceException):
+            return False
+        return True
+
+    wait(browser, clicked)
 
 
 def slider(browser: webdriver.Chrome, marker: str) -> WebElement:
