@@ -161,7 +161,7 @@ class GridworldPanel:
         self._status.text = self.simulation.status
         recent = [each.share_of_gradient for each in self.simulation.readings[-STALL_STEPS:]]
         self._share.text = (
-            f"The gradients of the last {len(recent)} batches have {np.mean(recent):.0%} of the true one (sampled). "
+            f"Gradients of sampled batches have {np.mean(recent):.0%} of the true one (mean of the last {len(recent)}). "
             "Unbiased estimates have 100% on average."
         )
         self._story.text = PRESETS[self._preset].story
