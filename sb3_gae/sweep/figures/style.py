@@ -39,6 +39,8 @@ def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
 
 
 _DASHES = ("-", "--", "-.", ":")
+# Of a few conditions that have no order: Okabe and Ito's, which the colour-blind can tell apart
+_UNORDERED = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9")
 # Of conditions without λ, where there are several: none of the colours of λ, and dashes for those who see no colours
 _WITHOUT_LAMBDA: tuple[tuple[str, tuple[int, ...]], ...] = (
     ("0.25", (5, 2)),
@@ -58,7 +60,8 @@ def line_styles(series: Sequence[Series]) -> list[dict[str, Any]]:
     gammas = sorted({curve.gamma for curve in of_lambda}, reverse=True)
     by_lambda = len(gammas) <= len(_DASHES) and len({curve.condition for curve in of_lambda}) == 1
     hues = list(dict.fromkeys(curve.gae_lambda if by_lambda else curve for curve in of_lambda))
-    shades = colormaps["turbo"](np.linspace(0.06, 0.92, max(len(hues), 1)))
+    ordered = by_lambda or len(hues) > len(_UNORDERED)
+    shades = colormaps["turbo"](np.linspace(0.06, 0.92, max(len(hues), 1))) if ordered else _UNORDERED
     without = [one.curve for one in series if one.curve.gae_lambda is None]
     styles: list[dict[str, Any]] = []
     for one in series:
