@@ -46,13 +46,22 @@ def test_links_lead_somewhere(document: Path, link: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "sweep", ["fig2-left", "fig3-left", "value-targets-cart-pole", "lambda-auto-HalfCheetah-v5", "lambda-auto-Hopper-v5"]
+    "arguments",
+    [
+        "--from benchmarks/results/sweeps/fig2-left.parquet",
+        "--from benchmarks/results/sweeps/fig3-left.parquet",
+        "--from benchmarks/results/sweeps/fig3-right.parquet",
+        "--by last --from benchmarks/results/sweeps/fig4b.parquet",
+        "--from benchmarks/results/sweeps/value-targets-cart-pole.parquet",
+        "--from benchmarks/results/sweeps/lambda-auto-HalfCheetah-v5.parquet",
+        "--from benchmarks/results/sweeps/lambda-auto-Hopper-v5.parquet",
+    ],
 )
 def test_tables_of_sweeps_are_what_the_command_prints(
-    sweep: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    arguments: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
-    command = f"python -m sb3_gae.sweep rank --from benchmarks/results/sweeps/{sweep}.parquet"
+    command = f"python -m sb3_gae.sweep rank {arguments}"
     text = (ROOT / "docs" / "paper-figures.md").read_text()
     assert f"{command}\n" in text
     assert main(command.split()[3:]) == 0
