@@ -1,0 +1,49 @@
+"""Sphinx's settings. Built by `make docs`, where a warning is an error."""
+
+import sys
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE / "_ext"))
+
+import sb3_gae  # noqa: E402
+
+project = "sb3-gae"
+author = "sb3-gae authors"
+copyright = f"2026, {author}"
+version = release = sb3_gae.__version__
+
+extensions = [
+    "myst_parser",
+    "mathml",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.doctest",
+    "sphinx.ext.intersphinx",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_build"]
+source_suffix = {".md": "markdown"}
+nitpicky = True
+
+myst_enable_extensions = ["colon_fence", "dollarmath", "fieldlist"]
+# Headings are linked to across pages by the names that GitHub gives them
+myst_heading_anchors = 3
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+
+# Inventories of what is linked to lie here: a build reaches nothing outside the machine
+intersphinx_mapping = {
+    "gymnasium": ("https://gymnasium.farama.org", "inventories/gymnasium.txt"),
+    "numpy": ("https://numpy.org/doc/stable", "inventories/numpy.txt"),
+    "python": ("https://docs.python.org/3", "inventories/python.txt"),
+    "sb3": ("https://stable-baselines3.readthedocs.io/en/master", "inventories/sb3.txt"),
+    "sb3-contrib": ("https://sb3-contrib.readthedocs.io/en/master", "inventories/sb3-contrib.txt"),
+    "torch": ("https://docs.pytorch.org/docs/stable", "inventories/torch.txt"),
+}
+
+html_theme = "furo"
+html_title = f"sb3-gae {version}"
+html_static_path = ["_static"]
+html_css_files = ["pictures.css"]
