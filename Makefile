@@ -4,6 +4,7 @@
 #   make test                      run the tests (fewer of them: ARGS="tests/test_zoo_hook.py -k spawn")
 #   make check                     formatting, lint, types
 #   make format                    put formatting right
+#   make docs                      build the book into docs/_build/html; a warning is an error
 #   make bench                     speed of an update beside sb3-contrib's
 #   make bench-full                also speed of whole iterations, what the shipped settings reach, and peers (days)
 #   make clean                     remove .venv and what builds and tools left
@@ -31,7 +32,7 @@ endif
 # Commands are run by name, as one would type them
 IN_VENV := PATH="$(CURDIR)/$(BIN):$$PATH"
 
-.PHONY: FORCE setup train test check format bench bench-full clean
+.PHONY: FORCE setup train test check format docs bench bench-full clean
 
 setup: $(STAMP)
 
@@ -42,7 +43,7 @@ $(STAMP): $(SETUP_FILES) $(ANEW)
 	@$(if $(ANEW),rm -f $@)
 	test -f $@ || $(PYTHON) -m venv --clear $(VENV)
 	@rm -f $@
-	$(BIN)/python -m pip install -c constraints.txt -e ".[tests]"
+	$(BIN)/python -m pip install -c constraints.txt -e ".[tests,docs]"
 	@touch $@
 
 train: $(STAMP)
@@ -59,6 +60,10 @@ check: $(STAMP)
 format: $(STAMP)
 	$(IN_VENV) ruff format .
 	$(IN_VENV) ruff check --fix .
+
+docs: $(STAMP)
+	$(IN_VENV) sphinx-build --fail-on-warning --keep-going --fresh-env -b html docs docs/_build/html
+	$(IN_VENV) sphinx-build --fail-on-warning --keep-going -b doctest docs docs/_build/doctest
 
 bench: $(STAMP)
 	$(IN_VENV) python benchmarks/update_speed.py $(ARGS)

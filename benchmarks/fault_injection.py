@@ -34,7 +34,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecNormalize
 
 from sb3_gae import TRPOGAE, NumericalError, ResumableCheckpointCallback
-from sb3_gae.checkpoint_file import checkpoints_in, is_whole
+from sb3_gae.saving.checkpoint_file import checkpoints_in, is_whole
 
 ITERATIONS, N_STEPS, N_ENVS = 8, 32, 2
 TOTAL = ITERATIONS * N_STEPS * N_ENVS

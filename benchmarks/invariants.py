@@ -9,11 +9,11 @@ from unittest import mock
 
 import torch as th
 
-import sb3_gae.policy_step
-import sb3_gae.value_step
+import sb3_gae.update.policy_step
+import sb3_gae.update.value_step
 from sb3_gae import TRPOGAE
-from sb3_gae.collection import training_batch
-from sb3_gae.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
+from sb3_gae.rollout.collection import training_batch
+from sb3_gae.update.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
 
 # Divergences are measured here in double precision, and in the update in single
 _TOLERANCE = 1e-3
@@ -75,6 +75,6 @@ def watched(model: TRPOGAE) -> Iterator[Watch]:
     """
     watch = Watch(model)
     with ExitStack() as patches:
-        for module in (sb3_gae.policy_step, sb3_gae.value_step):
+        for module in (sb3_gae.update.policy_step, sb3_gae.update.value_step):
             patches.enter_context(mock.patch.object(module, "trust_region_step", watch.step))
         yield watch

@@ -32,8 +32,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from sb3_gae import TRPOGAE, MujocoVecEnv
-from sb3_gae.collection import ActionSampler
 from sb3_gae.presets import LOCOMOTION_NETWORKS
+from sb3_gae.rollout.collection import ActionSampler
 from sb3_gae.vec_env.choice import batched_vec_env
 
 BATCH = 50_000

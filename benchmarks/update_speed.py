@@ -28,7 +28,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_gae import TRPOGAE, GAERolloutBuffer
-from sb3_gae.diagnostics import explained_variance
+from sb3_gae.estimators.measures import explained_variance
 from sb3_gae.presets import LOCOMOTION_NETWORKS
 
 N_ENVS = 16

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_gae.callbacks import PAPER_LAMBDAS
+from sb3_gae.estimators.group_statistics import gradient_errors
 from sb3_gae.gridworld import (
     TabularPolicy,
     episode_advantages,
@@ -22,7 +23,6 @@ from sb3_gae.gridworld import (
     response_function,
     sample_episodes,
 )
-from sb3_gae.group_statistics import gradient_errors
 
 IMAGES = Path(__file__).parent / "images"
 GAMMA = 0.95

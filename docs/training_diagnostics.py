@@ -27,16 +27,16 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import safe_mean
 
 from sb3_gae import TRPOGAE, GAERolloutBuffer
-from sb3_gae.advantages import discounted_returns, td_residuals
 from sb3_gae.callbacks import PAPER_LAMBDAS
-from sb3_gae.collection import training_batch
-from sb3_gae.diagnostics import lagged_signal, value_errors
-from sb3_gae.gradient_diagnostics import policy_gradients
-from sb3_gae.group_statistics import Estimate, mean_variance, squared_norm
-from sb3_gae.policy_step import policy_parameters
+from sb3_gae.diagnostics.policy_gradients import policy_gradients
+from sb3_gae.estimators.advantages import discounted_returns, td_residuals
+from sb3_gae.estimators.group_statistics import Estimate, mean_variance, squared_norm
+from sb3_gae.estimators.measures import lagged_signal, value_errors
+from sb3_gae.rollout.collection import training_batch
 from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.grid import Cell
 from sb3_gae.sweep.plan import Options
+from sb3_gae.update.policy_step import policy_parameters
 
 RESULTS = Path(__file__).parents[1] / "benchmarks" / "results" / "training_diagnostics.jsonl"
 N_GROUPS = 16

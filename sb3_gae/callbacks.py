@@ -9,10 +9,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae.checks import check_count
-from sb3_gae.diagnostics import ValueErrors, value_errors
-from sb3_gae.rollout_buffer import GAERolloutBuffer, LambdaSweep
-from sb3_gae.rollout_diagnostics import LambdaErrors, has_several_trajectories, lambda_errors
-from sb3_gae.rollout_file import record, save_rollout
+from sb3_gae.diagnostics.rollout_diagnostics import LambdaErrors, has_several_trajectories, lambda_errors
+from sb3_gae.diagnostics.rollout_file import record, save_rollout
+from sb3_gae.estimators.measures import ValueErrors, value_errors
+from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer, LambdaSweep
 
 #: the values of the paper's cart-pole figure
 PAPER_LAMBDAS = (0.0, 0.36, 0.68, 0.84, 0.92, 0.96, 0.98, 0.99, 1.0)
@@ -48,14 +48,14 @@ class GradientDiagnosticsCallback(BaseCallback):
     r"""
     Logs, after a rollout, how far the policy gradient is off with each :math:`\lambda`: bias, variance and their sum.
 
-    Estimated from the rollout itself, see :func:`~sb3_gae.rollout_diagnostics.lambda_errors`, with the policy that
+    Estimated from the rollout itself, see :func:`~sb3_gae.diagnostics.rollout_diagnostics.lambda_errors`, with the policy that
     collected it. A single rollout says little; average the curves over several. A rollout of a single trajectory is left out.
 
     Keys are ``gradient/<quantity>/lambda_<value>``, the quantities those of :class:`~sb3_gae.LambdaErrors`.
     The estimates of the last rollout that had any are in ``self.errors``. Beside them, to compare: ``value_error/<measure>``
-    with the measures of :class:`~sb3_gae.diagnostics.ValueErrors`, which are in ``self.value_errors``, and
+    with the measures of :class:`~sb3_gae.estimators.measures.ValueErrors`, which are in ``self.value_errors``, and
     ``value_error/policy_gradient``, the bias squared at :math:`\lambda = 0`
-    (:func:`~sb3_gae.rollout_diagnostics.policy_gradient_value_error`).
+    (:func:`~sb3_gae.diagnostics.rollout_diagnostics.policy_gradient_value_error`).
 
     :param lambdas: weights of longer estimates, each in [0, 1]
     :param every: rollouts from one estimate to the next, the first rollout being the first
@@ -111,7 +111,7 @@ class SaveRolloutCallback(BaseCallback):
     Saves each rollout as it ends, in the place of the one before, for ``python -m sb3_gae.gridworld --rollout``.
 
     What is saved serves to redo advantages, bias and variance with any :math:`\gamma` and :math:`\lambda`;
-    see :mod:`sb3_gae.rollout_file`. Scores of single steps take about as long as an update of 2 000 steps.
+    see :mod:`sb3_gae.diagnostics.rollout_file`. Scores of single steps take about as long as an update of 2 000 steps.
 
     :param path: of the file
     :param name: of what is recorded, None for the environment's

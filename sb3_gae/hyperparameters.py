@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from sb3_gae.checks import check_choice, check_count, check_number
-from sb3_gae.rollout_buffer import GAERolloutBuffer
+from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer
 
 _STEP_SIZE = "the sizes of the steps are set by `target_kl` and `vf_trust_region`"
 _ADAM = "or pass `vf_optimizer='adam'` to fit the value function as sb3-contrib's TRPO does"

@@ -7,14 +7,14 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_gae.advantages import discounted_returns
 from sb3_gae.checks import check_choice, check_number, check_unit_interval
-from sb3_gae.collection import training_batch
-from sb3_gae.diagnostics import explained_variance
-from sb3_gae.natural_gradients import has_natural_gradients
-from sb3_gae.policy_step import policy_parameters
-from sb3_gae.rollout_buffer import GAERolloutBuffer
-from sb3_gae.rollout_diagnostics import METRICS, expected_improvement, has_several_trajectories, lambda_errors
+from sb3_gae.diagnostics.rollout_diagnostics import METRICS, expected_improvement, has_several_trajectories, lambda_errors
+from sb3_gae.estimators.advantages import discounted_returns
+from sb3_gae.estimators.measures import explained_variance
+from sb3_gae.rollout.collection import training_batch
+from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer
+from sb3_gae.update.natural_gradients import has_natural_gradients
+from sb3_gae.update.policy_step import policy_parameters
 
 #: what :class:`MeasuredLambda` chooses from
 MEASURED_LAMBDAS = (0.68, 0.84, 0.92, 0.96, 0.98, 0.99, 1.0)
@@ -101,7 +101,7 @@ class MeasuredLambda:
     r"""
     The :math:`\lambda` of a grid that is best by what the batches themselves show of the policy gradient.
 
-    What is measured (:func:`~sb3_gae.rollout_diagnostics.lambda_errors`) says little in one batch, so it is
+    What is measured (:func:`~sb3_gae.diagnostics.rollout_diagnostics.lambda_errors`) says little in one batch, so it is
     averaged over batches, each in units of its own variance at :math:`\lambda = 1` because gradients change their scale
     in training. From one batch to the next it moves by one place of the grid at most.
 
@@ -110,7 +110,8 @@ class MeasuredLambda:
     :param memory: weight of the past in the averages
     :param patience: batches to watch before the first move
     :param criterion: ``"improvement"`` for the largest
-        :func:`~sb3_gae.rollout_diagnostics.expected_improvement`, ``"squared_error"`` for the least bias squared and variance
+        :func:`~sb3_gae.diagnostics.rollout_diagnostics.expected_improvement`, ``"squared_error"`` for the least bias
+        squared and variance
     :param metric: of the gradients, ``"fisher"`` or ``"euclidean"``. Policies that are no MLP as SB3 builds it have
         the latter in any case
     :param largest_target_lambda: what :math:`\lambda` of the value targets is at most where ``value_lambda`` is None; below,

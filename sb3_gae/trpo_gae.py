@@ -16,11 +16,13 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_gae.adam_fit import adam_fit
-from sb3_gae.all_or_nothing import all_or_nothing
 from sb3_gae.batch import TrainingBatch, random_subset, standardized
 from sb3_gae.checks import check_finite_parameters, check_finite_rollout, check_finite_step
-from sb3_gae.collection import (
+from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
+from sb3_gae.lambda_rules import LambdaRule, lambda_rule
+from sb3_gae.networks.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
+from sb3_gae.networks.value_head import ValueHead
+from sb3_gae.rollout.collection import (
     CollectsRollouts,
     Observations,
     RolloutEnd,
@@ -33,21 +35,19 @@ from sb3_gae.collection import (
     terminal_observations,
     training_batch,
 )
-from sb3_gae.episode_quota import EpisodeQuota
-from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
-from sb3_gae.lambda_rules import LambdaRule, lambda_rule
-from sb3_gae.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
-from sb3_gae.policy_step import policy_parameters, policy_step
-from sb3_gae.portable_model import PortableModel
-from sb3_gae.resumable import ResumableModel
-from sb3_gae.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
-from sb3_gae.shared_features import ParameterGroups, SharedParameters, policy_step_radius, shared_parameters
-from sb3_gae.threads import threads_for_steps
-from sb3_gae.time_baseline import TimeBaseline
-from sb3_gae.trust_region import StepRecord, TrustRegionSettings
-from sb3_gae.update_summary import update_summary
-from sb3_gae.value_head import ValueHead
-from sb3_gae.value_step import ValueFitRecord, value_parameters, value_steps
+from sb3_gae.rollout.episode_quota import EpisodeQuota
+from sb3_gae.rollout.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
+from sb3_gae.rollout.threads import threads_for_steps
+from sb3_gae.rollout.time_baseline import TimeBaseline
+from sb3_gae.saving.portable_model import PortableModel
+from sb3_gae.saving.resumable import ResumableModel
+from sb3_gae.update.adam_fit import adam_fit
+from sb3_gae.update.all_or_nothing import all_or_nothing
+from sb3_gae.update.policy_step import policy_parameters, policy_step
+from sb3_gae.update.shared_features import ParameterGroups, SharedParameters, policy_step_radius, shared_parameters
+from sb3_gae.update.summary import update_summary
+from sb3_gae.update.trust_region import StepRecord, TrustRegionSettings
+from sb3_gae.update.value_step import ValueFitRecord, value_parameters, value_steps
 from sb3_gae.workers.ray_vec_env import env_on_workers
 
 

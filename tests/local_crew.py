@@ -12,7 +12,7 @@ import torch as th
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gae.errors import WorkersLostError
-from sb3_gae.random_state import random_state, restore_random_state
+from sb3_gae.saving.random_state import random_state, restore_random_state
 from sb3_gae.workers.rollout_worker import RolloutWorker
 
 

@@ -26,8 +26,8 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, Flatten
 from torch import nn
 
 from sb3_gae.batch import TrainingBatch
-from sb3_gae.parameters import flatten
-from sb3_gae.policies import MlpPolicy
+from sb3_gae.networks.parameters import flatten
+from sb3_gae.networks.policies import MlpPolicy
 
 # --- Rollouts ---
 

@@ -16,7 +16,7 @@ from oracles import (
     rollouts,
 )
 
-from sb3_gae.advantages import (
+from sb3_gae.estimators.advantages import (
     advantage_grid,
     discounted_returns,
     effective_horizon,

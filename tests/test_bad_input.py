@@ -23,8 +23,8 @@ from envs_for_tests import (
 from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
 
-import sb3_gae.policy_step
-import sb3_gae.value_step
+import sb3_gae.update.policy_step
+import sb3_gae.update.value_step
 from sb3_gae import TRPOGAE, GAEDictRolloutBuffer, MlpPolicy, NumericalError
 
 BAD = [math.nan, math.inf, -math.inf]
@@ -220,14 +220,14 @@ def spoil(monkeypatch: pytest.MonkeyPatch, step: Any, **changes: Any) -> None:
 def test_a_bad_gradient_of_the_policy_is_refused(bad: float, monkeypatch: pytest.MonkeyPatch) -> None:
     model = small_model()
     train_once(model)
-    spoil(monkeypatch, sb3_gae.policy_step, gradient=lambda gradient: gradient.index_fill(0, th.tensor([3]), bad))
+    spoil(monkeypatch, sb3_gae.update.policy_step, gradient=lambda gradient: gradient.index_fill(0, th.tensor([3]), bad))
     check_refused(model, "gradient of the policy contains NaN or infinity")
 
 
 def test_a_bad_curvature_of_the_policy_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     model = small_model()
     train_once(model)
-    spoil(monkeypatch, sb3_gae.policy_step, curvature=lambda product: lambda vector: product(vector) * math.nan)
+    spoil(monkeypatch, sb3_gae.update.policy_step, curvature=lambda product: lambda vector: product(vector) * math.nan)
     check_refused(model, "curvature product of the policy contains NaN or infinity")
 
 
@@ -236,9 +236,9 @@ def test_a_bad_value_step_is_refused_and_undoes_the_policy_step_before_it(what: 
     model = small_model()
     train_once(model)
     if what == "gradient":
-        spoil(monkeypatch, sb3_gae.value_step, gradient=lambda gradient: gradient * math.inf)
+        spoil(monkeypatch, sb3_gae.update.value_step, gradient=lambda gradient: gradient * math.inf)
     else:
-        spoil(monkeypatch, sb3_gae.value_step, curvature=lambda product: lambda vector: product(vector) * math.nan)
+        spoil(monkeypatch, sb3_gae.update.value_step, curvature=lambda product: lambda vector: product(vector) * math.nan)
     check_refused(model, f"{what} of the value function contains NaN or infinity")
 
 
@@ -289,7 +289,7 @@ def test_linear_algebra_that_breaks_down_is_a_numerical_error(error: type[Except
 
     model = small_model()
     train_once(model)
-    spoil(monkeypatch, sb3_gae.policy_step, curvature=lambda product: breaks_down)
+    spoil(monkeypatch, sb3_gae.update.policy_step, curvature=lambda product: breaks_down)
     check_refused(model, "linear algebra of the update broke down: no such decomposition")
 
 

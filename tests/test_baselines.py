@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_gae import TRPOGAE, GAERolloutBuffer
-from sb3_gae.time_baseline import TimeBaseline, timesteps
+from sb3_gae.rollout.time_baseline import TimeBaseline, timesteps
 
 BOX = spaces.Box(-1.0, 1.0, (1,))
 

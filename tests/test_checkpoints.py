@@ -26,9 +26,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack, VecMonitor, VecNormalize
 
-import sb3_gae.checkpoint_callback
+import sb3_gae.saving.checkpoint_callback
 from sb3_gae import TRPOGAE, ResumableCheckpointCallback
-from sb3_gae.checkpoint_file import checkpoints_in, is_whole, read_checkpoint
+from sb3_gae.saving.checkpoint_file import checkpoints_in, is_whole, read_checkpoint
 
 
 def train(folder: Path, iterations: int = 3, **kwargs: Any) -> TRPOGAE:
@@ -223,7 +223,7 @@ class _Full:
 
 
 def test_a_write_that_failed_is_tried_again_in_the_next_iteration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    real, attempts = sb3_gae.checkpoint_callback.write_atomically, []
+    real, attempts = sb3_gae.saving.checkpoint_callback.write_atomically, []
 
     def second_fails(path: Path, *args: Any) -> None:
         attempts.append(path)
@@ -231,7 +231,7 @@ def test_a_write_that_failed_is_tried_again_in_the_next_iteration(tmp_path: Path
             raise OSError(errno.ENOSPC, "No space left on device")
         real(path, *args)
 
-    monkeypatch.setattr(sb3_gae.checkpoint_callback, "write_atomically", second_fails)
+    monkeypatch.setattr(sb3_gae.saving.checkpoint_callback, "write_atomically", second_fails)
     with pytest.warns(UserWarning, match="No checkpoint could be written"):
         train(tmp_path, 5, save_freq=64, keep=9)
     assert steps_in(tmp_path) == [5, 3, 0]
@@ -239,13 +239,13 @@ def test_a_write_that_failed_is_tried_again_in_the_next_iteration(tmp_path: Path
 
 def test_what_is_written_is_read_before_another_is_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that says yes and writes something else."""
-    real = sb3_gae.checkpoint_callback.write_atomically
+    real = sb3_gae.saving.checkpoint_callback.write_atomically
     train(tmp_path, 1, keep=1)
 
     def write_otherwise(path: Path, content: bytes, temporary: Path) -> None:
         real(path, damaged(content, "flipped", 5), temporary)
 
-    monkeypatch.setattr(sb3_gae.checkpoint_callback, "write_atomically", write_otherwise)
+    monkeypatch.setattr(sb3_gae.saving.checkpoint_callback, "write_atomically", write_otherwise)
     model = TRPOGAE.resume(tmp_path, cart_poles())
     with pytest.warns(UserWarning, match="checksum is wrong"):
         model.learn(2 * STEPS, callback=ResumableCheckpointCallback(1, tmp_path, keep=1), reset_num_timesteps=False)

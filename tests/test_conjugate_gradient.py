@@ -8,7 +8,7 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_gae.conjugate_gradient import CGResult, CGStatus, conjugate_gradient
+from sb3_gae.update.conjugate_gradient import CGResult, CGStatus, conjugate_gradient
 
 N = 8
 

@@ -20,16 +20,23 @@ from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from sb3_gae import MlpPolicy, SharedMlpPolicy, dense_network
-from sb3_gae.conjugate_gradient import conjugate_gradient
-from sb3_gae.curvature import CurvatureProduct, hessian_product
-from sb3_gae.dense_policy import dense_policy_network, dense_value_network, has_dense_policy, has_dense_value, policy_log_std
-from sb3_gae.distributions import fisher_metric, mean_kl, snapshot
-from sb3_gae.kronecker import KroneckerPreconditioner
-from sb3_gae.parameters import assign, flatten
-from sb3_gae.policy_step import DenseFisher, autograd_fisher_product, policy_parameters
-from sb3_gae.shared_features import shared_parameters
-from sb3_gae.value_step import value_parameters
+from sb3_gae import MlpPolicy, SharedMlpPolicy
+from sb3_gae.networks import dense_network
+from sb3_gae.networks.dense_policy import (
+    dense_policy_network,
+    dense_value_network,
+    has_dense_policy,
+    has_dense_value,
+    policy_log_std,
+)
+from sb3_gae.networks.distributions import fisher_metric, mean_kl, snapshot
+from sb3_gae.networks.parameters import assign, flatten
+from sb3_gae.update.conjugate_gradient import conjugate_gradient
+from sb3_gae.update.curvature import CurvatureProduct, hessian_product
+from sb3_gae.update.kronecker import KroneckerPreconditioner
+from sb3_gae.update.policy_step import DenseFisher, autograd_fisher_product, policy_parameters
+from sb3_gae.update.shared_features import shared_parameters
+from sb3_gae.update.value_step import value_parameters
 
 N_SAMPLES = 7
 each_space = pytest.mark.parametrize("action_space", ACTION_SPACES.values(), ids=ACTION_SPACES.keys())

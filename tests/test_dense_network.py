@@ -7,8 +7,8 @@ import torch as th
 from oracles import jacobian
 from torch import nn
 
-from sb3_gae import dense_network
-from sb3_gae.dense_network import DenseNetwork
+from sb3_gae.networks import dense_network
+from sb3_gae.networks.dense_network import DenseNetwork
 
 ACTIVATIONS: dict[str, nn.Module] = {
     "tanh": nn.Tanh(),

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from oracles import Rollout, direct_advantages, rollouts
 from tabular_oracles import random_policy
 
-from sb3_gae.diagnostics import explained_variance, lagged_signal, tabular_response, value_errors
+from sb3_gae.estimators.measures import explained_variance, lagged_signal, tabular_response, value_errors
+from sb3_gae.estimators.trajectory_groups import trajectory_indices
 from sb3_gae.gridworld import episode_deltas, gridworld, response_function, sample_episodes
-from sb3_gae.trajectory_groups import trajectory_indices
 
 factors = st.one_of(st.sampled_from([0.0, 1.0, 0.99]), st.floats(0.0, 1.0))
 

@@ -45,6 +45,17 @@ def test_links_lead_somewhere(document: Path, link: str) -> None:
     assert (document.parent / link).exists()
 
 
+def test_tests_that_the_theory_names_are_there() -> None:
+    named = re.findall(r"`tests/(\w+)\.py::(\w+)`", (ROOT / "docs" / "theory.md").read_text())
+    assert len(named) > 20
+    missing = [
+        f"{file}::{test}"
+        for file, test in named
+        if not re.search(rf"^def {test}\(", (ROOT / "tests" / f"{file}.py").read_text(), re.MULTILINE)
+    ]
+    assert not missing
+
+
 @pytest.mark.parametrize(
     "arguments",
     [

@@ -14,7 +14,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_gae import TRPOGAE
-from sb3_gae.episode_quota import EpisodeQuota
+from sb3_gae.rollout.episode_quota import EpisodeQuota
 
 
 class Stopwatch(gym.Env):

@@ -10,10 +10,10 @@ from oracles import ACTION_SPACES, OF_IMAGES, double_policy, jacobian, training_
 from tabular_oracles import random_policy
 
 from sb3_gae import MlpPolicy, MultiInputPolicy
-from sb3_gae import gradient_diagnostics as module
-from sb3_gae.gradient_diagnostics import policy_gradients
+from sb3_gae.diagnostics import policy_gradients as module
+from sb3_gae.diagnostics.policy_gradients import policy_gradients
 from sb3_gae.gridworld import episode_advantages, episode_gradients, gridworld, sample_episodes
-from sb3_gae.policy_step import policy_parameters
+from sb3_gae.update.policy_step import policy_parameters
 
 N_SAMPLES = 30
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tabular_oracles import all_trajectories, cyclic_mdp, layered_mdp, random_policy
 
-from sb3_gae.diagnostics import value_errors
+from sb3_gae.estimators.measures import value_errors
 from sb3_gae.gridworld import exact_value_errors, gridworld, sample_episodes
 
 GAMMA = 0.9

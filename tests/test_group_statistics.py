@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tabular_oracles import random_policy
 
+from sb3_gae.estimators.group_statistics import gradient_errors, mean_variance, squared_norm
+from sb3_gae.estimators.trajectory_groups import trajectory_groups, trajectory_indices
 from sb3_gae.gridworld import episode_advantages, episode_gradients, gridworld, sample_episodes
-from sb3_gae.group_statistics import gradient_errors, mean_variance, squared_norm
-from sb3_gae.trajectory_groups import trajectory_groups, trajectory_indices
 
 
 @given(st.integers(0, 1000), st.integers(2, 6), st.integers(1, 3), st.integers(1, 4))

@@ -6,9 +6,9 @@ import pytest
 import torch as th
 from torch import nn
 
-from sb3_gae.conjugate_gradient import CGStatus, conjugate_gradient
-from sb3_gae.dense_network import DenseNetwork
-from sb3_gae.kronecker import KroneckerPreconditioner
+from sb3_gae.networks.dense_network import DenseNetwork
+from sb3_gae.update.conjugate_gradient import CGStatus, conjugate_gradient
+from sb3_gae.update.kronecker import KroneckerPreconditioner
 
 
 def network_of(sizes: list[int], n_samples: int, bias: bool = True) -> DenseNetwork:
@@ -57,7 +57,7 @@ def test_the_factors_of_a_layer_are_the_second_moments_of_its_inputs_and_of_its_
 
 def test_several_blocks_give_the_factors_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = network_of([3, 5, 1], 40).kronecker_factors(th.ones(40, 1, dtype=th.double))
-    monkeypatch.setattr("sb3_gae.dense_network._BLOCK_ROWS", 7)
+    monkeypatch.setattr("sb3_gae.networks.dense_network._BLOCK_ROWS", 7)
     pieces = network_of([3, 5, 1], 40).kronecker_factors(th.ones(40, 1, dtype=th.double))
     for layer, layer_in_pieces in zip(whole, pieces, strict=True):
         for factor, factor_in_pieces in zip(layer, layer_in_pieces, strict=True):

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_gae.advantages import generalized_advantages
+from sb3_gae.estimators.advantages import generalized_advantages
 from sb3_gae.lab.controls import VALUE_FUNCTIONS, Controls
 from sb3_gae.lab.estimator import trace
 from sb3_gae.lab.moment import best_return, first_moment, world

@@ -10,10 +10,10 @@ from envs_for_tests import differing, small_model, state_of, train_once, vec_env
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_gae import TRPOGAE
-from sb3_gae.advantages import discounted_returns
+from sb3_gae.diagnostics.rollout_diagnostics import LambdaErrors, lambda_errors
+from sb3_gae.estimators.advantages import discounted_returns
 from sb3_gae.gridworld import TabularPolicy, gridworld
 from sb3_gae.lambda_rules import ExplainedVarianceLambda, MeasuredLambda
-from sb3_gae.rollout_diagnostics import LambdaErrors, lambda_errors
 
 GRID = (0.0, 0.5, 0.8, 0.9, 0.96, 1.0)
 

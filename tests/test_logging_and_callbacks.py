@@ -27,8 +27,8 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import explained_variance
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import sb3_gae.policy_step
-import sb3_gae.value_step
+import sb3_gae.update.policy_step
+import sb3_gae.update.value_step
 from sb3_gae import TRPOGAE
 
 
@@ -354,7 +354,7 @@ def test_a_policy_search_that_fails_restores_every_bit_and_logs_that_nothing_was
 ) -> None:
     model = small_model()
     train_once(model)
-    fail_searches(monkeypatch, sb3_gae.policy_step, objective, divergence)
+    fail_searches(monkeypatch, sb3_gae.update.policy_step, objective, divergence)
     before = state_of(model.policy)
     probe = KLProbe()
     logged = train_once(model, probe)
@@ -380,7 +380,7 @@ def test_a_value_search_that_fails_restores_the_values_and_logs_that_nothing_was
 ) -> None:
     model = small_model(normalize_value=False)
     train_once(model)
-    fail_searches(monkeypatch, sb3_gae.value_step, 1.0, 0.3)
+    fail_searches(monkeypatch, sb3_gae.update.value_step, 1.0, 0.3)
     before = state_of(model.policy)
     logged = train_once(model)
     assert (logged["train/vf_steps"], logged["train/vf_kl_divergence"]) == (0, 0.0)

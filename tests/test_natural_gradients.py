@@ -7,10 +7,10 @@ from gymnasium import spaces
 from oracles import double_policy, training_batch
 
 from sb3_gae.batch import TrainingBatch
-from sb3_gae.dense_policy import dense_policy_network
-from sb3_gae.natural_gradients import has_natural_gradients, natural_gradients
-from sb3_gae.policies import MlpPolicy
-from sb3_gae.policy_step import policy_parameters
+from sb3_gae.networks.dense_policy import dense_policy_network
+from sb3_gae.networks.policies import MlpPolicy
+from sb3_gae.update.natural_gradients import has_natural_gradients, natural_gradients
+from sb3_gae.update.policy_step import policy_parameters
 
 DAMPING = 0.3
 BOX, DISCRETE = spaces.Box(-1.0, 1.0, (2,)), spaces.Discrete(3)
@@ -71,7 +71,7 @@ def test_they_scale_with_the_gradients(scale: float) -> None:
 def test_a_large_batch_is_thinned_out_without_random_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     policy, batch, parameters = policy_and_batch(BOX, [4])
     gradients = np.random.default_rng(0).normal(size=(1, sum(parameter.numel() for parameter in parameters)))
-    monkeypatch.setattr("sb3_gae.natural_gradients._MOST_SAMPLES", 15)
+    monkeypatch.setattr("sb3_gae.update.natural_gradients._MOST_SAMPLES", 15)
     state = th.get_rng_state()
     found = natural_gradients(policy, parameters, batch, gradients)
     assert th.equal(th.get_rng_state(), state)

@@ -44,7 +44,7 @@ def test_settings_are_known_to_the_algorithm_or_the_zoo(task: str) -> None:
 def test_settings_are_found_in_a_package_and_in_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = tmp_path / "sb3_gae"
     package.mkdir()
-    monkeypatch.setattr(zoo, "__file__", str(package / "zoo.py"))
+    monkeypatch.setattr(zoo.registration, "__file__", str(package / "zoo" / "registration.py"))
     assert zoo.default_hyperparams_path() == tmp_path / "hyperparams" / "trpo_gae.yml"
 
     installed = package / "hyperparams" / "trpo_gae.yml"

@@ -8,7 +8,7 @@ from torch import nn
 
 from sb3_gae import batch as batch_module
 from sb3_gae.batch import TrainingBatch, batch_size, in_chunks, random_subset, standardized, take
-from sb3_gae.parameters import assign, flat_gradient, flatten, influencing_parameters, positions, unflatten
+from sb3_gae.networks.parameters import assign, flat_gradient, flatten, influencing_parameters, positions, unflatten
 
 # --- Parameters ---
 

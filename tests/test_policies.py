@@ -24,10 +24,10 @@ from torch import nn
 
 import sb3_gae.trpo_gae
 from sb3_gae import TRPOGAE, MlpPolicy
-from sb3_gae.collection import training_batch
-from sb3_gae.policy_step import policy_parameters
-from sb3_gae.value_head import ValueHead
-from sb3_gae.value_step import value_parameters
+from sb3_gae.networks.value_head import ValueHead
+from sb3_gae.rollout.collection import training_batch
+from sb3_gae.update.policy_step import policy_parameters
+from sb3_gae.update.value_step import value_parameters
 
 # What belongs to which step
 

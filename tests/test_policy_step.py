@@ -20,13 +20,14 @@ from oracles import (
 from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_gae import MlpPolicy, NumericalError, policy_step
+from sb3_gae import MlpPolicy, NumericalError
 from sb3_gae.batch import TrainingBatch, take
-from sb3_gae.conjugate_gradient import CGStatus
-from sb3_gae.dense_policy import dense_policy_network, policy_log_std
-from sb3_gae.distributions import snapshot
-from sb3_gae.parameters import flatten
-from sb3_gae.trust_region import StepRecord, TrustRegionSettings
+from sb3_gae.networks.dense_policy import dense_policy_network, policy_log_std
+from sb3_gae.networks.distributions import snapshot
+from sb3_gae.networks.parameters import flatten
+from sb3_gae.update import policy_step
+from sb3_gae.update.conjugate_gradient import CGStatus
+from sb3_gae.update.trust_region import StepRecord, TrustRegionSettings
 
 EXACT = TrustRegionSettings(radius=0.01, cg_max_steps=300, cg_damping=0.0)
 DAMPED = replace(EXACT, cg_damping=0.1, cg_max_steps=10)

@@ -14,7 +14,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from tabular_oracles import random_policy
 
 from sb3_gae import TRPOGAE, GAERolloutBuffer, GradientDiagnosticsCallback, MlpPolicy
-from sb3_gae.diagnostics import value_errors
+from sb3_gae.diagnostics.rollout_diagnostics import gradient_response, lambda_errors, policy_gradient_value_error
+from sb3_gae.estimators.group_statistics import gradient_errors
+from sb3_gae.estimators.measures import value_errors
 from sb3_gae.gridworld import (
     Episodes,
     TabularPolicy,
@@ -24,8 +26,6 @@ from sb3_gae.gridworld import (
     lagged_gradients,
     sample_episodes,
 )
-from sb3_gae.group_statistics import gradient_errors
-from sb3_gae.rollout_diagnostics import gradient_response, lambda_errors, policy_gradient_value_error
 
 LAMBDAS = (0.0, 0.9, 1.0)
 GAMMA = 0.95

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_gae import TRPOGAE, SaveRolloutCallback
-from sb3_gae.collection import training_batch
+from sb3_gae.diagnostics.projected_scores import projected_scores
+from sb3_gae.diagnostics.rollout_diagnostics import lambda_errors
+from sb3_gae.diagnostics.rollout_file import Rollout, load_rollout, save_rollout
 from sb3_gae.lab.rollout_view import SHIPPED_ROLLOUT, RolloutViewer
-from sb3_gae.projected_scores import projected_scores
-from sb3_gae.rollout_diagnostics import lambda_errors
-from sb3_gae.rollout_file import Rollout, load_rollout, save_rollout
+from sb3_gae.rollout.collection import training_batch
 
 
 @pytest.fixture(scope="module")

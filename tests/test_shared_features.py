@@ -28,16 +28,17 @@ from stable_baselines3.common.distributions import kl_divergence
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
-from sb3_gae import TRPOGAE, SharedMlpPolicy, shared_features, trust_region, value_step
+from sb3_gae import TRPOGAE, SharedMlpPolicy
 from sb3_gae.batch import TrainingBatch
-from sb3_gae.conjugate_gradient import conjugate_gradient
-from sb3_gae.distributions import snapshot
-from sb3_gae.kronecker import KroneckerPreconditioner
-from sb3_gae.parameters import flatten
-from sb3_gae.policy_step import policy_parameters
-from sb3_gae.shared_features import ParameterGroups, SharedParameters, SharedStep, policy_step_radius, shared_parameters
-from sb3_gae.trust_region import TrustRegionSettings
-from sb3_gae.value_step import ValueFitRecord, value_parameters, value_steps
+from sb3_gae.networks.distributions import snapshot
+from sb3_gae.networks.parameters import flatten
+from sb3_gae.update import shared_features, trust_region, value_step
+from sb3_gae.update.conjugate_gradient import conjugate_gradient
+from sb3_gae.update.kronecker import KroneckerPreconditioner
+from sb3_gae.update.policy_step import policy_parameters
+from sb3_gae.update.shared_features import ParameterGroups, SharedParameters, SharedStep, policy_step_radius, shared_parameters
+from sb3_gae.update.trust_region import TrustRegionSettings
+from sb3_gae.update.value_step import ValueFitRecord, value_parameters, value_steps
 
 EXACT = TrustRegionSettings(radius=0.05, cg_max_steps=400, cg_damping=0.05, max_scale=1.0)
 DEFAULTS = TrustRegionSettings(radius=0.2, cg_max_steps=10, cg_damping=1e-2, cg_progress_tolerance=0.1, max_scale=1.0)

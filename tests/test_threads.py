@@ -10,8 +10,8 @@ from envs_for_tests import CHANNEL_FIRST, AnySpacesEnv, small_model, vec_env
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_gae.collection import ActionSampler
 from sb3_gae.errors import NumericalError
+from sb3_gae.rollout.collection import ActionSampler
 
 
 @pytest.fixture(autouse=True)

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_gae import NumericalError
-from sb3_gae.conjugate_gradient import CGStatus
-from sb3_gae.parameters import assign, flatten
-from sb3_gae.trust_region import Constraint, LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
+from sb3_gae.networks.parameters import assign, flatten
+from sb3_gae.update.conjugate_gradient import CGStatus
+from sb3_gae.update.trust_region import Constraint, LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
 
 EXACT = TrustRegionSettings(radius=0.02, cg_max_steps=50, cg_damping=0.0)
 

@@ -14,8 +14,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from torch import nn
 
 from sb3_gae import MlpPolicy
-from sb3_gae.dense_policy import dense_value_network
-from sb3_gae.value_head import ValueHead
+from sb3_gae.networks.dense_policy import dense_value_network
+from sb3_gae.networks.value_head import ValueHead
 
 
 def new_head(bias: bool = True, dtype: th.dtype = th.float64) -> ValueHead:

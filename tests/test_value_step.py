@@ -9,12 +9,13 @@ from oracles import ACTION_SPACES, OF_IMAGES, double_policy, jacobian, moved, st
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import explained_variance
 
-from sb3_gae import NumericalError, SharedMlpPolicy, value_step
+from sb3_gae import NumericalError, SharedMlpPolicy
 from sb3_gae.batch import TrainingBatch, take
-from sb3_gae.parameters import flatten
-from sb3_gae.policy_step import policy_parameters
-from sb3_gae.trust_region import TrustRegionSettings
-from sb3_gae.value_step import ValueFitRecord, value_parameters, value_steps
+from sb3_gae.networks.parameters import flatten
+from sb3_gae.update import value_step
+from sb3_gae.update.policy_step import policy_parameters
+from sb3_gae.update.trust_region import TrustRegionSettings
+from sb3_gae.update.value_step import ValueFitRecord, value_parameters, value_steps
 
 BOX = ACTION_SPACES["Box"]
 EXACT = TrustRegionSettings(radius=0.05, cg_max_steps=300, cg_damping=0.0, max_scale=1.0)

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from stable_baselines3 import PPO
 
 from sb3_gae import TRPOGAE, MlpPolicy
-from sb3_gae.weights_file import _FORMAT, _digest, read_weights, weights_content
+from sb3_gae.saving.weights_file import _FORMAT, _digest, read_weights, weights_content
 
 
 def trained(**kwargs: Any) -> TRPOGAE:

@@ -9,7 +9,7 @@ from resuming import differences, everything
 from stable_baselines3.common.callbacks import BaseCallback
 from test_zoo_keys import manager, registered  # noqa: F401 - a fixture
 
-from sb3_gae.checkpoint_file import checkpoints_in
+from sb3_gae.saving.checkpoint_file import checkpoints_in
 
 ITERATION = 32  # timesteps, by the settings of test_zoo_keys
 NORMALIZED = {"normalize": True, "n_timesteps": 4 * ITERATION, "batched_envs": True}

@@ -5,8 +5,9 @@ from contextlib import AbstractContextManager
 from typing import Any
 from unittest import mock
 
-from sb3_gae import TRPOGAE, GAERolloutBuffer, trust_region
-from sb3_gae.collection import ActionSampler
+from sb3_gae import TRPOGAE, GAERolloutBuffer
+from sb3_gae.rollout.collection import ActionSampler
+from sb3_gae.update import trust_region
 
 
 def twice(function: Callable[..., Any]) -> Callable[..., Any]:

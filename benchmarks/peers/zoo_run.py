@@ -17,7 +17,7 @@ from benchmarks.peers.protocol import evaluation_interval
 from benchmarks.peers.recorder import Recorder
 from benchmarks.peers.zoo_callbacks import StartClock, StopClock
 from sb3_gae import ResumableCheckpointCallback
-from sb3_gae.checkpoint_file import newest_checkpoint, timesteps_of
+from sb3_gae.saving.checkpoint_file import newest_checkpoint, timesteps_of
 
 _CHECKPOINTS = "checkpoints"
 

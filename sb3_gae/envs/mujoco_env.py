@@ -12,7 +12,7 @@ from sb3_gae.envs.mujoco_task import FULL_PHYSICS, MujocoTask, is_physical, tota
 
 class MujocoTaskEnv(gym.Env):
     """
-    A gymnasium environment of a task; :class:`~sb3_gae.vec_env.MujocoVecEnv` steps many of them in one call.
+    A gymnasium environment of a task; :class:`~sb3_gae.MujocoVecEnv` steps many of them in one call.
 
     ``info`` has the terms of the reward by name and, in a step whose numbers blew up, ``numerical_failure``. Such
     a step ends the episode as a time limit would, with the state before it as the last, and all its terms are 0.

@@ -71,7 +71,7 @@ def gridworld(
     """
     A square of cells with a goal worth +1 and a trap worth -1, where episodes end.
 
-    State ``row * size + column`` is a cell, row 0 on top; the actions are :data:`MOVES`. A move against a wall stays
+    State ``row * size + column`` is a cell, row 0 on top; the actions are ``MOVES``. A move against a wall stays
     in place. With the default ``slip`` what follows an action is noisy, so that even the exact value function
     leaves temporal-difference residuals some variance, while the intended move still decides.
 

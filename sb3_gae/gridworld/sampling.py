@@ -1,11 +1,11 @@
-"""Episodes drawn from a tabular policy, as arrays that the functions in :mod:`sb3_gae.advantages` take."""
+"""Episodes drawn from a tabular policy, as arrays that the functions in :mod:`sb3_gae.estimators.advantages` take."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from sb3_gae.advantages import discounted_returns, generalized_advantages, td_residuals
 from sb3_gae.checks import check_count, check_number
+from sb3_gae.estimators.advantages import discounted_returns, generalized_advantages, td_residuals
 from sb3_gae.gridworld.exact import TabularPolicy
 
 

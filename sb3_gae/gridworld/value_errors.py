@@ -1,4 +1,4 @@
-r"""Errors of a value function, exactly: the truth behind :func:`~sb3_gae.diagnostics.value_errors`."""
+r"""Errors of a value function, exactly: the truth behind :func:`~sb3_gae.estimators.measures.value_errors`."""
 
 from typing import NamedTuple
 

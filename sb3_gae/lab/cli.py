@@ -7,8 +7,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_gae.diagnostics.rollout_file import load_rollout
 from sb3_gae.lab.rollout_view import SHIPPED_ROLLOUT, RolloutViewer
-from sb3_gae.rollout_file import load_rollout
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8080
 

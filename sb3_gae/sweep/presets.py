@@ -98,7 +98,7 @@ PRESETS: dict[str, Preset] = {
 
 def find_preset(name: str) -> Preset:
     """
-    :param name: a key of :data:`PRESETS`
+    :param name: a key of ``PRESETS``
     :return: the preset
     :raises SweepError: if there is none of that name
     """

@@ -27,7 +27,7 @@ COLUMNS = ("format", "sweep", *CELL_COLUMNS, *ROW_COLUMNS, "setup_seconds", "tri
 def results_of(study: SweepStudy) -> pd.DataFrame:
     """
     :param study: of a sweep
-    :return: finished cells, with the columns of :data:`COLUMNS`, in the order of their trials
+    :return: finished cells, with the columns of :data:`~sb3_gae.sweep.results.COLUMNS`, in the order of their trials
     """
     done = [standing.trial for standing in study.standings().values() if standing.status == Status.DONE]
     rows = [row for trial in sorted(filter(None, done), key=lambda trial: trial.number) for row in _rows_of(trial, study.name)]
@@ -54,7 +54,7 @@ def _rows_of(trial: FrozenTrial, sweep: str) -> Iterator[dict[str, Any]]:
 def read_results(path: str | Path) -> pd.DataFrame:
     """
     :param path: of an exported ``.csv`` (perhaps compressed) or ``.parquet`` file
-    :return: its table, with the columns of :data:`COLUMNS`
+    :return: its table, with the columns of :data:`~sb3_gae.sweep.results.COLUMNS`
     :raises SweepError: if there is no such file, it is something else, or another version wrote it
     """
     path = Path(path)

@@ -138,8 +138,8 @@ class SweepStudy:
         Take in a cell that was run elsewhere.
 
         :param cell: that is done
-        :param rows: see :meth:`Claim.append`
-        :param what: see :meth:`Claim.describe`
+        :param rows: see :meth:`~sb3_gae.sweep.study.Claim.append`
+        :param what: see :meth:`~sb3_gae.sweep.study.Claim.describe`
         :return: False if the cell was done here already, which stays as it is
         """
         standing = self.standings().get(cell.key)
@@ -233,7 +233,7 @@ class Claim:
         """
         Store a piece of the learning curve.
 
-        :param rows: one for each iteration, with the columns of :data:`~sb3_gae.sweep.recorder.COLUMNS`
+        :param rows: one for each iteration, with the columns of ``sb3_gae.sweep.recorder.COLUMNS``
         """
         if not rows:
             return

@@ -38,11 +38,11 @@ def run_sweep(
 
     With ``jobs`` above 1 processes are spawned: call it below ``if __name__ == "__main__":``.
 
-    :param preset: a key of :data:`~sb3_gae.sweep.PRESETS`; None for the product of what follows
+    :param preset: a key of ``sb3_gae.sweep.PRESETS``; None for the product of what follows
     :param env: one or several tasks; with a preset, in place of its task
     :param gammas: discount factors, each in [0, 1]
     :param lambdas: weights of longer estimates, each in [0, 1]
-    :param conditions: keys of :data:`~sb3_gae.sweep.CONDITIONS`; None for ``trust_region``
+    :param conditions: keys of ``sb3_gae.sweep.CONDITIONS``; None for ``trust_region``
     :param seeds: how many, from 0, or which
     :param iterations: batches of each run
     :param hyperparams: that differ from the settings file, as rl-zoo3's ``-params``
@@ -56,7 +56,7 @@ def run_sweep(
     :param gym_packages: modules that register environments
     :param retry_failed: whether cells that failed are run again
     :param progress: whether to show a bar
-    :return: a row for each iteration of each finished cell of the grid, as :func:`~sb3_gae.sweep.results_of`
+    :return: a row for each iteration of each finished cell of the grid, as :func:`~sb3_gae.sweep.results.results_of`
     :raises SweepError: if an argument is wrong, or the storage cannot be used
     """
     grid = dict(env=env, gammas=gammas, lambdas=lambdas, conditions=conditions, seeds=seeds, iterations=iterations)

@@ -16,8 +16,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_gae.checks import check_count
-from sb3_gae.collection import RolloutPlan, Step
 from sb3_gae.errors import WorkersLostError
+from sb3_gae.rollout.collection import RolloutPlan, Step
 from sb3_gae.vec_env.choice import batched_vec_env
 from sb3_gae.workers.crew import Crew
 from sb3_gae.workers.rollout_worker import ShareOrder, portable_policy, weights_of

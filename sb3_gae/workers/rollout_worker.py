@@ -17,8 +17,8 @@ from stable_baselines3.common import monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wrapped
 
-from sb3_gae.collection import Observations, RolloutPlan
-from sb3_gae.environment_state import EnvironmentState, environment_state, restore_environment
+from sb3_gae.rollout.collection import Observations, RolloutPlan
+from sb3_gae.saving.environment_state import EnvironmentState, environment_state, restore_environment
 from sb3_gae.workers.share import Share, collect_share
 from sb3_gae.workers.wrappers import ObservationWatch, seen_through, wrap
 

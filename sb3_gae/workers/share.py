@@ -7,8 +7,8 @@ import numpy as np
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_gae.collection import Observations, RolloutPlan, Step, environment_actions, take_steps
-from sb3_gae.episode_quota import EpisodeQuota
+from sb3_gae.rollout.collection import Observations, RolloutPlan, Step, environment_actions, take_steps
+from sb3_gae.rollout.episode_quota import EpisodeQuota
 from sb3_gae.workers.moments import Moments
 
 #: of each key of a Dict observation, or of the observation itself under None

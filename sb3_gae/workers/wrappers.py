@@ -15,7 +15,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize, VecTransposeImage
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
-from sb3_gae.collection import Observations
+from sb3_gae.rollout.collection import Observations
 from sb3_gae.workers.moments import Moments, RunningMoments
 from sb3_gae.workers.share import ObservationMoments, Share
 

@@ -3,11 +3,11 @@
 import numpy as np
 from nicegui import events, ui
 
+from sb3_gae.diagnostics.rollout_file import MAX_BYTES, load_rollout
 from sb3_gae.lab.page.pace import Pace
 from sb3_gae.lab.page.widgets import Knob, panel, picture
 from sb3_gae.lab.pictures import Axes, Band, Line, bar_chart, line_chart, round_up
 from sb3_gae.lab.rollout_view import RolloutViewer, View
-from sb3_gae.rollout_file import MAX_BYTES, load_rollout
 
 
 class RolloutPanel:

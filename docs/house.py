@@ -1,0 +1,169 @@
+"""
+Draws the rooms of the package and who imports whom, as docs/images/house.svg, from the imports themselves.
+
+    python docs/house.py
+
+A room is a folder or a single file of sb3_gae; the commands (``__main__``) are a room of their own. An arrow means that
+the upper room imports the lower one; those that follow from others are left out. A test fails when the picture is not that
+of the code.
+"""
+
+import ast
+from collections.abc import Iterator, Mapping
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1] / "sb3_gae"
+PICTURE = Path(__file__).parent / "images" / "house.svg"
+COMMANDS = "python -m"
+
+Edges = Mapping[str, set[str]]
+
+WIDTH, ROW, HEIGHT, MARGIN = 132, 84, 34, 14
+STYLE = """
+  .room { fill: #fff; stroke: #555; } .file { fill: #f3f3f0; stroke: #999; } text { fill: #222; }
+  .arrow { fill: none; stroke: #8a8a8a; } .head { fill: #8a8a8a; }
+  text { font: 13px sans-serif; text-anchor: middle; }
+  @media (prefers-color-scheme: dark) {
+    .room { fill: #2b2b2b; stroke: #bbb; } .file { fill: #222; stroke: #888; } text { fill: #eee; }
+  }"""
+
+
+def room_of(file: Path) -> str:
+    """
+    :param file: of the package, relative to it
+    :return: its room
+    """
+    if file.name == "__main__.py":
+        return COMMANDS
+    return file.parts[0] if len(file.parts) > 1 else file.stem.replace("__init__", "sb3_gae")
+
+
+def imported_by(file: Path) -> Iterator[str]:
+    """
+    :param file: of the package
+    :return: the first name below ``sb3_gae`` of everything that it imports from there
+    """
+    for node in ast.walk(ast.parse(file.read_text())):
+        names: list[str] = []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [f"{node.module}.{alias.name}" for alias in node.names] if node.module == "sb3_gae" else [node.module]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        yield from (name.split(".")[1] for name in names if name.startswith("sb3_gae.") and name != "sb3_gae.__version__")
+
+
+def rooms(package: Path = PACKAGE) -> dict[str, set[str]]:
+    """
+    :param package: folder
+    :return: for each room those that it imports
+    """
+    edges: dict[str, set[str]] = {}
+    for file in sorted(package.rglob("*.py")):
+        room = room_of(file.relative_to(package))
+        edges.setdefault(room, set()).update(set(imported_by(file)) - {room})
+    return edges
+
+
+def without_shortcuts(edges: Edges) -> dict[str, set[str]]:
+    """
+    :param edges: without a ring
+    :return: those that do not follow from others
+    :raises graphlib.CycleError: if there is a ring
+    """
+    reached: dict[str, set[str]] = {}
+    for room in TopologicalSorter(edges).static_order():
+        reached[room] = set().union(*({below} | reached[below] for below in edges.get(room, ())))
+    return {
+        room: {below for below in belows if not any(below in reached[other] for other in belows)}
+        for room, belows in edges.items()
+    }
+
+
+def floors(edges: Edges) -> list[list[str]]:
+    """
+    :param edges: without a ring
+    :return: rooms by floor, the cellar last: each above all that it imports
+    """
+    height: dict[str, int] = {}
+    for room in TopologicalSorter(edges).static_order():
+        height[room] = 1 + max((height[below] for below in edges.get(room, ())), default=-1)
+    found: list[list[str]] = [[] for _ in range(max(height.values()) + 1)]
+    for room in sorted(height):
+        found[-1 - height[room]].append(room)
+    return found
+
+
+def places(edges: Edges) -> dict[str, tuple[float, float]]:
+    """
+    :param edges: without a ring
+    :return: the middle of each room's box, in pixels
+    """
+    rows = floors(edges)
+    widest = max(map(len, rows)) * (WIDTH + MARGIN)
+    found: dict[str, tuple[float, float]] = {}
+    for number, row in enumerate(rows):
+        above = {room: [found[upper][0] for upper in found if room in edges.get(upper, ())] for room in row}
+        row.sort(key=lambda room: (sum(above[room]) / len(above[room]) if above[room] else widest / 2, room))
+        for place, room in enumerate(row):
+            found[room] = (widest * (place + 0.5) / len(row), MARGIN + number * ROW + HEIGHT / 2)
+    return found
+
+
+def arrow(upper: tuple[float, float], lower: tuple[float, float]) -> str:
+    """
+    :param upper: middle of a box
+    :param lower: middle of the box that the arrow leads to
+    :return: as SVG
+    """
+    (x, y), (u, v) = upper, lower
+    y, v = y + HEIGHT / 2, v - HEIGHT / 2
+    curve = f"M{x:.0f} {y:.0f}C{x:.0f} {y + 30:.0f} {u:.0f} {v - 30:.0f} {u:.0f} {v:.0f}"
+    return f'<path class="arrow" marker-end="url(#head)" d="{curve}"/>'
+
+
+def box(room: str, kind: str, middle: tuple[float, float]) -> str:
+    """
+    :param room: its name
+    :param kind: ``"room"`` or ``"file"``
+    :param middle: in pixels
+    :return: as SVG
+    """
+    x, y = middle
+    corner = f'x="{x - WIDTH / 2:.0f}" y="{y - HEIGHT / 2:.0f}"'
+    return (
+        f'<rect class="{kind}" {corner} width="{WIDTH}" height="{HEIGHT}" rx="6"/>'
+        f'<text x="{x:.0f}" y="{y + 4:.0f}">{room}</text>'
+    )
+
+
+def picture(edges: Edges, folders: set[str]) -> str:
+    """
+    :param edges: see :func:`rooms`
+    :param folders: rooms with several files
+    :return: as SVG
+    """
+    few = without_shortcuts(edges)
+    where = places(few)
+    width = max(x for x, _ in where.values()) + WIDTH / 2 + MARGIN
+    height = max(y for _, y in where.values()) + HEIGHT
+    size = f'viewBox="0 0 {width:.0f} {height:.0f}"'
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img" aria-label="Rooms and imports">',
+        f"<style>{STYLE}\n</style>",
+        '<marker id="head" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
+        '<path class="head" d="M0 0L8 4L0 8z"/></marker>',
+        *(arrow(where[upper], where[lower]) for upper in sorted(few) for lower in sorted(few[upper])),
+        *(box(room, "room" if room in folders else "file", where[room]) for room in sorted(where)),
+    ]
+    return "\n".join([*lines, "</svg>", ""])
+
+
+def house() -> str:
+    """:return: the picture of the code as it is"""
+    return picture(rooms(), {folder.name for folder in PACKAGE.iterdir() if folder.is_dir()} | {COMMANDS})
+
+
+if __name__ == "__main__":
+    PICTURE.write_text(house())
+    print(PICTURE)

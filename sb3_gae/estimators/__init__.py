@@ -1,0 +1,1 @@
+"""Advantages, returns and measures of value functions: pure functions of NumPy arrays."""

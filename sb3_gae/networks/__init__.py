@@ -1,0 +1,1 @@
+"""SB3's policies with a scaled value head, their distributions, and MLPs with kept activations."""

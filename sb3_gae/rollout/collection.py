@@ -1,0 +1,289 @@
+"""Pieces of the collection of a rollout: its steps, endings of a step, values of the whole, and what to train on."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.utils import obs_as_tensor
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_gae.batch import TrainingBatch, as_float, in_chunks
+from sb3_gae.checks import check_finite_rollout, check_finite_step
+from sb3_gae.errors import NumericalError
+from sb3_gae.estimators.advantages import discounted_returns
+from sb3_gae.networks.dense_policy import gaussian_layers
+from sb3_gae.rollout.episode_quota import EpisodeQuota
+from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer
+
+Observations = np.ndarray | dict[str, np.ndarray]
+
+
+class TerminalObservation(NamedTuple):
+    """
+    :param step: of the rollout, at the end of which the time limit struck
+    :param env: index of the environment
+    :param observation: the last one of the episode, without a batch axis
+    """
+
+    step: int
+    env: int
+    observation: Observations
+
+
+class RolloutEnd(NamedTuple):
+    """
+    What a rollout leads on to, which is not among its steps.
+
+    :param terminal: where time limits struck
+    :param observations: after the last step, shape (N, ...), or a dictionary of such
+    :param dones: whether the last step ended an episode, shape (N,)
+    """
+
+    terminal: list[TerminalObservation]
+    observations: Observations
+    dones: np.ndarray
+
+
+class RolloutPlan(NamedTuple):
+    """
+    :param n_steps: the most that each environment takes
+    :param n_episodes: that each environment finishes; None for all the steps
+    :param use_sde: whether the policy explores by gSDE
+    :param sde_sample_freq: steps from one noise matrix to the next; -1 for one at the beginning alone
+    """
+
+    n_steps: int
+    n_episodes: int | None = None
+    use_sde: bool = False
+    sde_sample_freq: int = -1
+
+
+class Step(NamedTuple):
+    """
+    One step of all environments.
+
+    :param observations: what the actions were chosen on, shape (N, ...), or a dictionary of such
+    :param episode_starts: whether it was the first step of its episode, shape (N,)
+    :param actions: as the distribution gave them, in the shape of the action space, (N, ...)
+    :param clipped_actions: as the environments took them
+    :param new_observations: what followed, the first ones of new episodes where one ended
+    :param rewards: shape (N,)
+    :param dones: whether it was the last step of its episode, shape (N,)
+    :param infos: of each environment
+    :param n_taken: number of environments that took the step
+    """
+
+    observations: Observations
+    episode_starts: np.ndarray
+    actions: np.ndarray
+    clipped_actions: np.ndarray
+    new_observations: Observations
+    rewards: np.ndarray
+    dones: np.ndarray
+    infos: list[dict[str, Any]]
+    n_taken: int
+
+
+@runtime_checkable
+class CollectsRollouts(Protocol):
+    """Environments that take the steps of a whole rollout by themselves, such as those on Ray workers."""
+
+    def collect_rollout(self, policy: ActorCriticPolicy, env: VecEnv, plan: RolloutPlan) -> Iterator[Step]:
+        """
+        :param policy: in evaluation mode
+        :param env: these environments in their wrappers
+        :param plan: how many steps to take
+        :return: the steps as they would have been taken one by one; those of an environment that has finished its episodes
+            before others are empty and end no episode
+        """
+
+
+class ActionSampler:
+    """
+    Draws the actions of the steps of one rollout.
+
+    A Gaussian MLP is asked for its layers, which draws the same actions as the policy itself without making and checking a
+    distribution in each step.
+
+    :param policy: in evaluation mode
+    """
+
+    def __init__(self, policy: ActorCriticPolicy):
+        self._policy = policy
+        self._layers = gaussian_layers(policy)
+        self._std = policy.log_std.detach().exp() if self._layers else None
+
+    def __call__(self, observations: Observations, step: int) -> np.ndarray:
+        """
+        :param observations: finite, shape (N, ...), or a dictionary of such
+        :param step: of the rollout, for messages
+        :return: actions as the distribution gives them, in the shape of the action space, (N, ...)
+        :raises NumericalError: if an action, or a parameter of the distribution, is not finite
+        """
+        try:
+            with th.no_grad():
+                actions = self._draw(obs_as_tensor(observations, self._policy.device)).cpu().numpy()
+            actions = actions.reshape(-1, *self._policy.action_space.shape)  # type: ignore[misc]
+        except ValueError as error:
+            # So torch refuses the parameters of a distribution
+            raise NumericalError(f"The action distribution is invalid at step {step} of the rollout: {error}") from error
+        check_finite_step("action", actions, step)
+        return actions
+
+    def _draw(self, observations: Any) -> th.Tensor:
+        if self._std is None:
+            return self._policy._predict(observations)
+        mean = observations.float()
+        for layer in self._layers:
+            mean = layer(mean)
+        return mean + th.normal(th.zeros_like(mean), th.ones_like(mean)) * self._std
+
+
+def environment_actions(policy: ActorCriticPolicy, actions: np.ndarray) -> np.ndarray:
+    """
+    :param policy: owner of the action space
+    :param actions: as the distribution gave them, in the shape of the action space, (N, ...)
+    :return: within the bounds of the action space: scaled if the policy squashes, else clipped
+    """
+    space = policy.action_space
+    if not isinstance(space, spaces.Box):
+        return actions
+    return policy.unscale_action(actions) if policy.squash_output else np.clip(actions, space.low, space.high)
+
+
+def take_steps(
+    policy: ActorCriticPolicy,
+    env: VecEnv,
+    observations: Observations,
+    episode_starts: np.ndarray,
+    plan: RolloutPlan,
+    quota: EpisodeQuota,
+    first_env: int = 0,
+) -> Iterator[Step]:
+    """
+    The steps of a rollout, each taken when it is asked for.
+
+    :param policy: in evaluation mode
+    :param env: to step
+    :param observations: of the environments as they stand, shape (N, ...), or a dictionary of such
+    :param episode_starts: whether they stand at the beginning of an episode, shape (N,)
+    :param plan: how many steps to take
+    :param quota: whoever takes the steps adds the endings; the last step is the one that meets it
+    :param first_env: number of the first environment, for messages
+    :raises NumericalError: if an observation, action or reward is not finite
+    """
+    if plan.use_sde:
+        policy.reset_noise(env.num_envs)
+    sample = ActionSampler(policy)
+    for step in range(plan.n_steps):
+        if quota.is_met:
+            return
+        if plan.use_sde and plan.sde_sample_freq > 0 and step % plan.sde_sample_freq == 0:
+            policy.reset_noise(env.num_envs)
+        actions = sample(observations, step)
+        clipped_actions = environment_actions(policy, actions)
+        result = env.step(clipped_actions)
+        new_observations, (_, rewards, dones, infos) = cast(Observations, result[0]), result
+        check_finite_step("reward", rewards, step, first_env)
+        check_finite_step("observation", new_observations, step + 1, first_env)
+        yield Step(
+            observations, episode_starts, actions, clipped_actions, new_observations, rewards, dones, infos, env.num_envs
+        )
+        observations, episode_starts = new_observations, dones
+
+
+def terminal_observations(step: int, dones: np.ndarray, infos: list[dict[str, Any]]) -> list[TerminalObservation]:
+    """
+    :param step: of the rollout
+    :param dones: whether each environment's episode ended, shape (N,)
+    :param infos: of the step
+    :return: those whose episode was cut by a time limit, so that what would have followed counts
+    :raises NumericalError: if such an observation is not finite
+    """
+    endings = [
+        TerminalObservation(step, env, infos[env]["terminal_observation"])
+        for env in np.flatnonzero(dones).tolist()
+        if infos[env].get("TimeLimit.truncated", False) and infos[env].get("terminal_observation") is not None
+    ]
+    for ending in endings:
+        check_finite_step("terminal observation", _stack([ending.observation]), step, ending.env)
+    return endings
+
+
+def evaluate_rollout(policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer, end: RolloutEnd) -> th.Tensor:
+    """
+    Give a full buffer its values and log-probabilities, computed for all of it at once.
+
+    :param policy: in evaluation mode, as it was when the rollout was collected
+    :param rollout_buffer: full
+    :param end: of the rollout
+    :return: values of the last observations, shape (N,)
+    :raises NumericalError: if a value or a log-probability is not finite
+    """
+    samples, mask = rollout_buffer.batch(), rollout_buffer.mask
+    actions = distribution_actions(policy.action_space, samples.actions)
+
+    def evaluate(observations: Any, actions: th.Tensor) -> th.Tensor:
+        values, log_probs, _ = policy.evaluate_actions(observations, actions)
+        return th.stack([values.flatten(), log_probs], dim=1)
+
+    evaluated = in_chunks(evaluate, samples.observations, actions).cpu().numpy()
+    values, log_probs = np.zeros((2, *mask.shape), dtype=evaluated.dtype)
+    values[mask], log_probs[mask] = evaluated.T
+    check_finite_rollout("value", values)
+    check_finite_rollout("log-probability", log_probs)
+    rollout_buffer.set_values(values, log_probs, _bootstrap_values(policy, end.terminal, mask.shape))
+    return _predict_values(policy, end.observations)
+
+
+def distribution_actions(action_space: spaces.Space, actions: th.Tensor) -> th.Tensor:
+    """
+    :param action_space: of the environment
+    :param actions: as the buffer keeps them, shape (B, n_actions)
+    :return: as the distribution takes them: whole numbers of shape (B,) for Discrete
+    """
+    return actions.long().flatten() if isinstance(action_space, spaces.Discrete) else actions
+
+
+def training_batch(rollout_buffer: GAERolloutBuffer, action_space: spaces.Space) -> TrainingBatch:
+    """
+    :param rollout_buffer: full, with its advantages computed
+    :param action_space: of the environment
+    :return: all of it, flattened, as the steps of an update take it
+    """
+    samples = rollout_buffer.batch()
+    actions = distribution_actions(action_space, samples.actions)
+    return TrainingBatch(as_float(samples.observations), actions, samples.advantages, samples.returns)
+
+
+def reward_returns(rollout_buffer: GAERolloutBuffer) -> np.ndarray:
+    """
+    :param rollout_buffer: full
+    :return: discounted returns of the rewards alone, no value function involved, shape (``n_samples``,)
+    :raises NumericalError: if a return is not finite
+    """
+    nothing = np.zeros_like(rollout_buffer.rewards)
+    returns = discounted_returns(rollout_buffer.rewards, nothing, rollout_buffer.dones, rollout_buffer.gamma)
+    check_finite_rollout("discounted return", returns)
+    return returns[rollout_buffer.mask]
+
+
+def _bootstrap_values(policy: ActorCriticPolicy, terminal: list[TerminalObservation], shape: tuple[int, ...]) -> np.ndarray:
+    bootstrap_values = np.zeros(shape, dtype=np.float32)
+    if terminal:
+        steps, envs = [ending.step for ending in terminal], [ending.env for ending in terminal]
+        bootstrap_values[steps, envs] = _predict_values(policy, _stack([ending.observation for ending in terminal])).cpu()
+    return bootstrap_values
+
+
+def _predict_values(policy: ActorCriticPolicy, observations: Observations) -> th.Tensor:
+    return in_chunks(lambda part: policy.predict_values(part).flatten(), obs_as_tensor(observations, policy.device))
+
+
+def _stack(observations: list[Observations]) -> Observations:
+    if isinstance(observations[0], dict):
+        return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
+    return np.stack(observations)  # type: ignore[arg-type]
