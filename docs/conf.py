@@ -32,6 +32,13 @@ myst_enable_extensions = ["colon_fence", "dollarmath", "fieldlist"]
 # Headings are linked to across pages by the names that GitHub gives them
 myst_heading_anchors = 3
 
+doctest_global_setup = """
+import numpy as np
+
+from sb3_gae.estimators.advantages import *
+from sb3_gae.estimators.measures import *
+"""
+
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
 autodoc_default_options = {"members": True, "show-inheritance": True}

@@ -60,6 +60,11 @@ def generalized_advantages(deltas: FloatArray, dones: np.ndarray, gamma: float, 
     ``gae_lambda=0`` gives the residuals themselves (eq. 17), ``gae_lambda=1`` the discounted return
     less the value of the state (eq. 18).
 
+    >>> deltas = np.array([[1.0], [1.0], [1.0]])  # three steps of one environment
+    >>> dones = np.array([[False], [True], [False]])  # the second ends an episode
+    >>> generalized_advantages(deltas, dones, gamma=1.0, gae_lambda=0.5).ravel()
+    array([1.5, 1. , 1. ])
+
     :param deltas: see :func:`td_residuals`, shape (T, N)
     :param dones: whether the step was the last one of its episode, shape (T, N)
     :param gamma: discount factor
@@ -115,6 +120,9 @@ def discounted_returns(rewards: FloatArray, next_values: FloatArray, dones: np.n
 def effective_horizon(gamma: ArrayLike, gae_lambda: ArrayLike) -> FloatArray:
     r"""
     Number of steps that the estimator looks ahead, :math:`1 / (1 - \gamma\lambda)` (paper, section 4).
+
+    >>> float(effective_horizon(0.99, 0.96).round(1))
+    20.2
 
     :param gamma: discount factor
     :param gae_lambda: weight of longer estimates

@@ -13,6 +13,9 @@ def explained_variance(predictions: np.ndarray, targets: np.ndarray) -> float:
     r"""
     :math:`1 - \mathrm{Var}(y - \hat y) / \mathrm{Var}(y)`: 1 is perfect, 0 no better than a constant, below 0 worse.
 
+    >>> explained_variance(np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 4.0]))
+    0.857...
+
     :param predictions: any shape
     :param targets: same shape
     :return: not a number if the targets are constant, as in SB3
