@@ -2,26 +2,13 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from sb3_gae.envs.mujoco_env import MujocoTaskEnv
-from sb3_gae.envs.mujoco_task import MujocoTask, PhysicsStates
+from sb3_gae.envs.run_forward import RunForward
 
 LEGS = ("right_leg_force", "left_leg_force")
 
 
-def impact_cost(states: PhysicsStates, sensors: tuple[str, ...], largest: float) -> np.ndarray:
-    """
-    :param states: N states
-    :param sensors: names of three-dimensional forces, in newtons
-    :param largest: each component is cut to this before it is squared, in newtons
-    :return: sum of the squares, shape (N,)
-    """
-    forces = np.concatenate([states.sensors[name] for name in sensors], axis=1)
-    return np.square(np.clip(forces, -largest, largest)).sum(axis=1)
-
-
-class Biped(MujocoTask):
+class Biped(RunForward):
     """
     Reward :math:`v_{fwd} - 10^{-5}|u|^2 - 10^{-5}|f_{impact}|^2 + 0.2`; see :class:`GaeBipedEnv`.
     """
@@ -35,33 +22,16 @@ class Biped(MujocoTask):
         lowest_height: float = 0.8,
         reset_noise: float = 0.02,
     ):
-        super().__init__(Path(__file__).with_name("biped.xml"))
-        self.torque_cost_weight = torque_cost_weight
-        self.impact_cost_weight = impact_cost_weight
-        self.largest_impact_force = largest_impact_force
-        self.alive_bonus = alive_bonus
-        self.lowest_height = lowest_height
-        self.reset_noise = reset_noise
-        self._gears = self.model.actuator_gear[:, 0].copy()
-
-    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """The standing pose, every number moved by up to ``reset_noise``."""
-        qpos, qvel = super().initial_state(rng)
-        noise = self.reset_noise
-        return qpos + rng.uniform(-noise, noise, qpos.shape), qvel + rng.uniform(-noise, noise, qvel.shape)
-
-    def reward_terms(self, states: PhysicsStates) -> dict[str, np.ndarray]:
-        torques = states.controls * self._gears
-        return {
-            "forward_velocity": states.sensors["torso_velocity"][:, 0],
-            "torque_cost": -self.torque_cost_weight * np.square(torques).sum(axis=1),
-            "impact_cost": -self.impact_cost_weight * impact_cost(states, LEGS, self.largest_impact_force),
-            "alive_bonus": np.full(len(torques), self.alive_bonus),
-        }
-
-    def terminated(self, states: PhysicsStates) -> np.ndarray:
-        """Whether the torso is lower than ``lowest_height``."""
-        return states.qpos[:, 2] < self.lowest_height
+        super().__init__(
+            Path(__file__).with_name("biped.xml"),
+            LEGS,
+            torque_cost_weight=torque_cost_weight,
+            impact_cost_weight=impact_cost_weight,
+            largest_impact_force=largest_impact_force,
+            alive_bonus=alive_bonus,
+            lowest_height=lowest_height,
+            reset_noise=reset_noise,
+        )
 
 
 class GaeBipedEnv(MujocoTaskEnv):

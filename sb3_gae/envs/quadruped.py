@@ -5,15 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_gae.envs.biped import impact_cost
 from sb3_gae.envs.mujoco_env import MujocoTaskEnv
-from sb3_gae.envs.mujoco_task import MujocoTask, PhysicsStates
+from sb3_gae.envs.run_forward import RunForward
 
 LEGS = ("front_left_leg_force", "back_left_leg_force", "back_right_leg_force", "front_right_leg_force")
 
 
-class Quadruped(MujocoTask):
-    """Reward :math:`v_{fwd} - 10^{-6}|u|^2 - 10^{-3}|f_{impact}|^2 + 0.05`; see :class:`GaeQuadrupedEnv`."""
+class Quadruped(RunForward):
+    """
+    Reward :math:`v_{fwd} - 10^{-6}|u|^2 - 10^{-3}|f_{impact}|^2 + 0.05`; see :class:`GaeQuadrupedEnv`.
+    """
 
     def __init__(
         self,
@@ -24,35 +25,22 @@ class Quadruped(MujocoTask):
         lowest_height: float = 0.2,
         reset_noise: float = 0.02,
     ):
-        super().__init__(Path(__file__).with_name("quadruped.xml"))
-        self.torque_cost_weight = torque_cost_weight
-        self.impact_cost_weight = impact_cost_weight
-        self.largest_impact_force = largest_impact_force
-        self.alive_bonus = alive_bonus
-        self.lowest_height = lowest_height
-        self.reset_noise = reset_noise
-        self._gears = self.model.actuator_gear[:, 0].copy()
+        super().__init__(
+            Path(__file__).with_name("quadruped.xml"),
+            LEGS,
+            torque_cost_weight=torque_cost_weight,
+            impact_cost_weight=impact_cost_weight,
+            largest_impact_force=largest_impact_force,
+            alive_bonus=alive_bonus,
+            lowest_height=lowest_height,
+            reset_noise=reset_noise,
+        )
 
-    def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """The standing pose, every number moved by up to ``reset_noise``."""
-        qpos, qvel = super().initial_state(rng)
+    def standing_pose(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        qpos, qvel = super().standing_pose(rng)
         # Ankles bent until the feet stand below the ends of the legs' lower halves
         qpos[8::2] = math.radians(57.0)
-        noise = self.reset_noise
-        return qpos + rng.uniform(-noise, noise, qpos.shape), qvel + rng.uniform(-noise, noise, qvel.shape)
-
-    def reward_terms(self, states: PhysicsStates) -> dict[str, np.ndarray]:
-        torques = states.controls * self._gears
-        return {
-            "forward_velocity": states.sensors["torso_velocity"][:, 0],
-            "torque_cost": -self.torque_cost_weight * np.square(torques).sum(axis=1),
-            "impact_cost": -self.impact_cost_weight * impact_cost(states, LEGS, self.largest_impact_force),
-            "alive_bonus": np.full(len(torques), self.alive_bonus),
-        }
-
-    def terminated(self, states: PhysicsStates) -> np.ndarray:
-        """Whether the torso is lower than ``lowest_height``."""
-        return states.qpos[:, 2] < self.lowest_height
+        return qpos, qvel
 
 
 class GaeQuadrupedEnv(MujocoTaskEnv):
