@@ -4,6 +4,7 @@ import errno
 import os
 import signal
 import threading
+import time
 import warnings
 from pathlib import Path
 from typing import Any, ClassVar
@@ -203,6 +204,21 @@ def test_a_full_disk_stops_nothing_and_the_last_good_one_stays(
     assert differences(expected, everything(model)) == []
     assert checkpoints_in(folder)[0] == good and is_whole(good)
     assert not list(folder.glob(".*")), "no rest of an attempt"
+
+
+def test_a_clock_before_1980_stops_nothing_and_the_last_good_one_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = everything(train(tmp_path / "whole", 4))
+    folder = tmp_path / "past"
+    train(folder, 2)
+    model = TRPOGAE.resume(folder, cart_poles())
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "time", lambda: -1e9)
+        with pytest.warns(UserWarning, match=r"No checkpoint could be written: the clock .*before 1980.*Training goes on"):
+            model.learn(2 * STEPS, callback=ResumableCheckpointCallback(1, folder), reset_num_timesteps=False)
+    assert differences(expected, everything(model)) == []
+    assert checkpoints_in(folder)[0] == folder / f"rl_model_{2 * STEPS}_steps.zip"
 
 
 class _Full:

@@ -127,8 +127,8 @@ class ResumableCheckpointCallback(BaseCallback):
             return
         self._next_save = self.n_calls + self.save_freq
         states = callback_states(self.locals["callback"], self._fresh[0])
-        content = checkpoint_content(self.model, training_state(self.model, states))
         try:
+            content = checkpoint_content(self.model, training_state(self.model, states))
             write_atomically(path, content, self.save_path / f".{self.name_prefix}.tmp")
             read_checkpoint(path)
             self._delete_old()

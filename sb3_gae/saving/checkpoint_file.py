@@ -25,11 +25,17 @@ def checkpoint_content(model: BaseAlgorithm, state: bytes) -> bytes:
     :param model: to be saved
     :param state: of the training
     :return: what to write into the file
+    :raises OSError: if the clock stands before 1980, where zip files begin
     """
     memory = io.BytesIO()
-    model.save(memory)
+    try:
+        model.save(memory)
+    except ValueError as error:
+        if "timestamps" not in str(error):
+            raise
+        raise OSError(f"the clock of this machine stands at an impossible time ({error}).") from error
     with zipfile.ZipFile(memory, "a", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr(_STATE, state)
+        archive.writestr(zipfile.ZipInfo(_STATE), state, zipfile.ZIP_DEFLATED)
         # The length of the comment stands before it, so it must be there when the checksum is taken
         archive.comment = _SEAL + b"0" * _DIGEST_LENGTH
     sealed = memory.getvalue()[:-_DIGEST_LENGTH]
