@@ -1,6 +1,7 @@
 """Tiny environments for the tests of the algorithm, and what many of these tests do with a model."""
 
 import copy
+import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -63,6 +64,14 @@ class AnySpacesEnv(gym.Env):
 
     def reward(self, action: Any) -> float:
         return self.reward_scale * (float(np.mean(action)) + 0.1 * float(self.np_random.normal()))
+
+
+class SlowEnv(AnySpacesEnv):
+    """Gives a test the time to kill its process in the middle of a share."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        time.sleep(0.01)
+        return super().step(action)
 
 
 class BadNumberEnv(AnySpacesEnv):

@@ -2,14 +2,13 @@
 
 import os
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from envs_for_tests import SMALL, AnySpacesEnv
+from envs_for_tests import SMALL, AnySpacesEnv, SlowEnv
 from local_crew import LocalCrew
 from resuming import differences, everything
 from stable_baselines3.common.callbacks import BaseCallback
@@ -53,14 +52,6 @@ def workers(cluster: None) -> Iterator[VecEnv]:
     env = make_vec_env(SlowEnv, 2, vec_env_cls=RayVecEnv, vec_env_kwargs={"n_workers": 2})  # type: ignore[type-var]
     yield env
     env.close()
-
-
-class SlowEnv(AnySpacesEnv):
-    """Gives a test the time to kill its process in the middle of a share."""
-
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        time.sleep(0.01)
-        return super().step(action)
 
 
 def make_model(env: VecEnv, **kwargs: Any) -> TRPOGAE:
@@ -108,6 +99,25 @@ def test_two_runs_are_the_same_and_those_of_workers_anywhere_else(
 def test_a_worker_killed_in_the_middle_of_its_share_changes_nothing(workers: VecEnv, expected: dict[str, Any]) -> None:
     with pytest.warns(UserWarning, match=r"Worker 1 was lost .* another collects its share again"):
         found = trained(workers, KillDuring(workers, 1))
+    assert differences(expected, found) == []
+
+
+def test_a_new_worker_that_is_lost_in_its_turn_changes_nothing(
+    workers: Any, expected: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on, lost = workers._go_on_where_it_stood, []
+
+    def lose_once_and_go_on(worker: int) -> None:
+        if not lost:
+            lost.append(worker)
+            ray.kill(workers._crew._actors[worker])
+        go_on(worker)
+
+    monkeypatch.setattr(workers, "_go_on_where_it_stood", lose_once_and_go_on)
+    with pytest.warns(UserWarning, match="Worker 1 was lost") as warned:
+        found = trained(workers, KillDuring(workers, 1))
+    assert lost == [1]
+    assert len([warning for warning in warned if "was lost" in str(warning.message)]) == 2
     assert differences(expected, found) == []
 
 

@@ -23,6 +23,23 @@ _PULSE = 1.0
 _SECONDS_TO_WARN, _SECONDS_TO_START = 60.0, 900.0
 
 
+class Shared:
+    """
+    A value for all workers, in Ray's store.
+
+    :param put: puts it there
+    :param value: the value
+    """
+
+    def __init__(self, put: Callable[[Any], Any], value: Any):
+        self._put, self._value = put, value
+        self.reference = put(value)
+
+    def put_anew(self) -> None:
+        """A machine that joins may else ask a lost one for its copy, again and again, until Ray gives that machine up."""
+        self.reference = self._put(self._value)
+
+
 class Crew:
     """
     Ray actors, each a :class:`~sb3_gae.workers.rollout_worker.RolloutWorker`.
@@ -51,13 +68,13 @@ class Crew:
     def __len__(self) -> int:
         return len(self._actors)
 
-    def share(self, value: Any) -> Any:
+    def share(self, value: Any) -> Shared:
         """
         :param value: for all workers; it goes to each machine once
         :return: to be given as an argument in its place
         """
         self._check_ray()
-        return self._ray.put(value)
+        return Shared(self._ray.put, value)
 
     def ask(
         self,
@@ -104,8 +121,10 @@ class Crew:
                 except self._ray.exceptions.RayTaskError as error:
                     raise error.cause from error
                 except self._signs_of_loss() as error:
-                    losses[worker] += 1
-                    self._replace(worker, losses[worker], error, replaced)
+                    losses[worker] = self._replace(worker, losses[worker], error, replaced)
+                    for argument in of_worker[worker]:
+                        if isinstance(argument, Shared):
+                            argument.put_anew()
                     pending[self._submit(worker, method, of_worker[worker])] = worker
         return [answers[worker] for worker in workers]
 
@@ -120,23 +139,42 @@ class Crew:
         return self._actor_class.remote(self._makers[worker], self._cpus_per_worker, str(Path.cwd()), is_replacement)
 
     def _submit(self, worker: int, method: str, arguments: tuple[Any, ...]) -> Any:
-        return getattr(self._actors[worker], method).remote(*arguments)
+        references = [argument.reference if isinstance(argument, Shared) else argument for argument in arguments]
+        return getattr(self._actors[worker], method).remote(*references)
 
-    def _replace(self, worker: int, n_losses: int, error: Exception, replaced: Callable[[int], None] | None) -> None:
+    def _replace(self, worker: int, n_losses: int, error: Exception, replaced: Callable[[int], None] | None) -> int:
+        """
+        :param worker: its number
+        :param n_losses: with the same question, before this one
+        :param error: that tells of the loss
+        :param replaced: of :meth:`ask`
+        :return: losses with the same question
+        """
+        while True:
+            n_losses += 1
+            self._check_replaceable(worker, n_losses, error, replaced)
+            warnings.warn(f"Worker {worker} was lost ({_first_line(error)}); another collects its share again.", stacklevel=4)
+            try:
+                self._actors[worker] = self._new_actor(worker, is_replacement=True)
+                self.ask("start", [()], workers=[worker], patience=_SECONDS_TO_START)
+                assert replaced is not None
+                replaced(worker)
+                return n_losses
+            except WorkersLostError as loss:
+                if not isinstance(loss.__cause__, self._signs_of_loss()):
+                    raise
+                # The new worker in its turn: it may have begun on the same machine, while that went down
+                error = loss.__cause__
+
+    def _check_replaceable(self, worker: int, n_losses: int, error: Exception, replaced: Callable[[int], None] | None) -> None:
         self._check_ray()
-        # The first sentence; what follows are pages of where to look for logs
-        reason = str(error).strip().partition("\n")[0]
         if replaced is None:
-            raise WorkersLostError(f"Worker {worker} was lost ({reason})") from error
+            raise WorkersLostError(f"Worker {worker} was lost ({_first_line(error)})") from error
         if n_losses >= _MOST_LOSSES:
             raise WorkersLostError(
-                f"Worker {worker} was lost {n_losses} times with the same share ({reason}); look for an environment that "
-                "crashes or takes too much memory."
+                f"Worker {worker} was lost {n_losses} times with the same share ({_first_line(error)}); look for an "
+                "environment that crashes or takes too much memory."
             ) from error
-        warnings.warn(f"Worker {worker} was lost ({reason}); another collects its share again.", stacklevel=4)
-        self._actors[worker] = self._new_actor(worker, is_replacement=True)
-        self.ask("start", [()], workers=[worker], patience=_SECONDS_TO_START)
-        replaced(worker)
 
     def _signs_of_loss(self) -> tuple[type[Exception], ...]:
         exceptions = self._ray.exceptions
@@ -169,6 +207,11 @@ class Crew:
             f"{n_missing} of {len(self)} workers of {self._cpus_per_worker} CPU each have not started in {seconds:.0f} s; "
             f"Ray has {cpus[0]:g} of {cpus[1]:g} CPUs free. If it has no place for them, add machines or use fewer workers."
         )
+
+
+def _first_line(error: Exception) -> str:
+    """What follows are pages of where to look for logs."""
+    return str(error).strip().partition("\n")[0]
 
 
 def ensure_ray(n_cpus: int) -> ModuleType:
