@@ -56,23 +56,24 @@ class StopAt(BaseCallback):
     Ends training between two iterations, which a return value of ``_on_step`` would not.
 
     :param deadline: of the monotonic clock
+    :param last_update: after how many updates of the whole training this life is over. (A number that the callback counted
+        by itself would come back with the checkpoint, and end the next life before it begins.)
     """
 
     class Over(Exception):
         """The time is over, or the life is."""
 
-    def __init__(self, deadline: float):
+    def __init__(self, deadline: float, last_update: int):
         super().__init__()
         self.deadline = deadline
-        self.iterations = 0
+        self.last_update = last_update
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
-        if self.iterations == ITERATIONS_A_LIFE or time.monotonic() >= self.deadline:
+        if self.model._n_updates >= self.last_update or time.monotonic() >= self.deadline:
             raise self.Over
-        self.iterations += 1
 
 
 def live(folder: Path, deadline: float, counts: Counter[str]) -> list[str]:
@@ -81,7 +82,8 @@ def live(folder: Path, deadline: float, counts: Counter[str]) -> list[str]:
     resumed = any(folder.iterdir())
     kwargs = {"n_steps": N_STEPS, "gae_lambda": "auto", "seed": 0}
     model = TRPOGAE.resume(folder, env) if resumed else TRPOGAE("MlpPolicy", env, **kwargs)  # type: ignore[arg-type]
-    callback = [ResumableCheckpointCallback(1, folder), StopAt(deadline)]
+    before = model._n_updates
+    callback = [ResumableCheckpointCallback(1, folder), StopAt(deadline, before + ITERATIONS_A_LIFE)]
     with watched(model) as watch:
         try:
             model.learn(10**9, callback=callback, reset_num_timesteps=not resumed)
@@ -91,7 +93,9 @@ def live(folder: Path, deadline: float, counts: Counter[str]) -> list[str]:
             env.close()
     counts.update(watch.counts)
     counts["iterations"] = model._n_updates
-    return watch.violations
+    counts["lives"] += 1
+    whole = model._n_updates == before + ITERATIONS_A_LIFE or time.monotonic() >= deadline
+    return watch.violations + ([] if whole else [f"a life of {model._n_updates - before} iterations"])
 
 
 def main(arguments: list[str]) -> int:
