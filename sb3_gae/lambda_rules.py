@@ -19,7 +19,7 @@ from sb3_gae.update.policy_step import policy_parameters
 #: what :class:`MeasuredLambda` chooses from
 MEASURED_LAMBDAS = (0.68, 0.84, 0.92, 0.96, 0.98, 0.99, 1.0)
 #: what it may choose by
-CRITERIA = ("improvement", "squared_error")
+CRITERIA = ("squared_error", "improvement")
 
 
 @runtime_checkable
@@ -109,9 +109,8 @@ class MeasuredLambda:
     :param start: where to begin; the nearest of the grid
     :param memory: weight of the past in the averages
     :param patience: batches to watch before the first move
-    :param criterion: ``"improvement"`` for the largest
-        :func:`~sb3_gae.diagnostics.rollout_diagnostics.expected_improvement`, ``"squared_error"`` for the least bias
-        squared and variance
+    :param criterion: ``"squared_error"`` for the least bias squared and variance, ``"improvement"`` for the largest
+        :func:`~sb3_gae.diagnostics.rollout_diagnostics.expected_improvement`
     :param metric: of the gradients, ``"fisher"`` or ``"euclidean"``. Policies that are no MLP as SB3 builds it have
         the latter in any case
     :param largest_target_lambda: what :math:`\lambda` of the value targets is at most where ``value_lambda`` is None; below,
@@ -126,8 +125,8 @@ class MeasuredLambda:
         start: float = 0.96,
         memory: float = 0.95,
         patience: int = 5,
-        criterion: str = "improvement",
-        metric: str = "fisher",
+        criterion: str = "squared_error",
+        metric: str = "euclidean",
         largest_target_lambda: float = 0.96,
     ):
         check_unit_interval("lambdas", lambdas)
@@ -192,7 +191,7 @@ class MeasuredLambda:
 #: what ``gae_lambda`` may be as a text
 _NAMED_RULES: dict[str, Callable[[], LambdaRule]] = {
     "auto": MeasuredLambda,
-    "least_squared_error": lambda: MeasuredLambda(criterion="squared_error", metric="euclidean"),
+    "improvement": lambda: MeasuredLambda(criterion="improvement", metric="fisher"),
     "explained_variance": ExplainedVarianceLambda,
 }
 

@@ -74,9 +74,9 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
     :param line_search_max_iter: largest number of trials
     :param n_critic_updates: Adam's epochs; read only with ``vf_optimizer="adam"`` (default: 10)
     :param gae_lambda: :math:`\lambda` of the advantages: 0 trusts the value function, 1 the returns. A function of the
-        remaining progress for a schedule; ``"auto"`` to choose it by what rollouts show of the policy gradient
-        (:class:`~sb3_gae.lambda_rules.MeasuredLambda`); ``"least_squared_error"`` and ``"explained_variance"`` for rules that
-        this is to be compared with; or a rule of :mod:`sb3_gae.lambda_rules`. The attribute ``gae_lambda`` is always
+        remaining progress for a schedule; ``"auto"`` to choose it by what rollouts show of the policy gradient's
+        squared error (:class:`~sb3_gae.lambda_rules.MeasuredLambda`); ``"improvement"`` and ``"explained_variance"`` for rules
+        that this is to be compared with; or a rule of :mod:`sb3_gae.lambda_rules`. The attribute ``gae_lambda`` is always
         the number in use
     :param use_sde: whether to use generalized state-dependent exploration
     :param sde_sample_freq: sample a new noise matrix every so many steps; -1 only at the start of a rollout
