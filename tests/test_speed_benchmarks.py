@@ -1,4 +1,4 @@
-"""The arithmetic of the speed benchmarks; what they time is left to `python -m benchmarks.speed`, since tests do not time things."""
+"""The arithmetic of the speed benchmarks; to time things is left to `python -m benchmarks.speed`."""
 
 import copy
 import math
@@ -93,10 +93,12 @@ def test_an_update_is_what_torch_counts(model: TRPOGAE, curvature_samples: int |
 
     found = [counted(step), counted(fit)]
     update.rewind()
-    steps = [ops.solved(record) for record in records["value"].steps]
+    policy, *steps = (
+        ops.solved(record.cg_status, record.cg_steps, record.trials) for record in (records["policy"], *records["value"].steps)
+    )
     assert len(steps) > 1
     assert found == [
-        ops.operations(ops.policy_step(LAYERS, BATCH, n_curvature, ops.solved(records["policy"]))),
+        ops.operations(ops.policy_step(LAYERS, BATCH, n_curvature, policy)),
         ops.operations(ops.value_fit(VALUE_LAYERS, BATCH, n_curvature, steps)),
     ]
 

@@ -29,12 +29,12 @@ and a forward pass over B for each trial of the line search. A value step is the
 the last trial of the step before. Its curvature needs no forward pass of its own where C is B.
 """
 
+import itertools
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from sb3_gae.conjugate_gradient import CGStatus
-from sb3_gae.trust_region import StepRecord
 
 
 class Product(NamedTuple):
@@ -86,8 +86,7 @@ def layers_of(n_in: int, hidden: Sequence[int], n_out: int) -> list[Layer]:
     :param n_out: outputs of the network
     :return: from the first to the last
     """
-    widths = [n_in, *hidden, n_out]
-    return [Layer(*pair) for pair in zip(widths[:-1], widths[1:], strict=True)]
+    return [Layer(*pair) for pair in itertools.pairwise([n_in, *hidden, n_out])]
 
 
 def n_parameters(layers: Iterable[Layer]) -> int:
@@ -196,18 +195,19 @@ def kronecker_solve(layers: Sequence[Layer]) -> Products:
     return times(Counter(sides), 2)
 
 
-def solved(record: StepRecord) -> Solved:
+def solved(status: CGStatus, steps: int, trials: int) -> Solved:
     """
-    :param record: of a step
-    :return: what it took
+    :param status: how conjugate gradient ended
+    :param steps: curvature products that entered the direction
+    :param trials: lengths that the line search tried
+    :return: what that took
     """
-    steps = record.cg_steps
-    if record.cg_status is CGStatus.ZERO_GRADIENT:
-        return Solved(0, 0, record.trials)
+    if status is CGStatus.ZERO_GRADIENT:
+        return Solved(0, 0, trials)
     # One that was found to have no positive curvature is not among the steps
-    products = steps + (record.cg_status is CGStatus.NON_POSITIVE_CURVATURE)
+    products = steps + (status is CGStatus.NON_POSITIVE_CURVATURE)
     # One for the first direction and one after each step, but not after the one that ends the solve
-    return Solved(products, steps + (record.cg_status is not CGStatus.CONVERGED), record.trials)
+    return Solved(products, steps + (status is not CGStatus.CONVERGED), trials)
 
 
 def conjugate_gradient(layers: Sequence[Layer], batch: int, what: Solved) -> Products:
