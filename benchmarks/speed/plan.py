@@ -46,7 +46,7 @@ def plan(quick: bool, threads: int) -> Plan:
     if quick:
         sizes = ((784, 1_568, 3_136), (16, 32, 64), 784, grids, (4, 8, 16), 32, (12, 24, 49), (32, 64, 128))
         return Plan(True, threads, *sizes, seconds=0.05, least_rounds=2, most_rounds=5)
-    sizes = ((3_136, 12_544, 50_176), (64, 160, 400), 12_544, grids, (16, 64, 256), 256, (12, 49, 196), (256, 1_024, 4_096))
+    sizes = ((3_136, 12_544, 50_176), (64, 128, 256), 12_544, grids, (16, 64, 256), 256, (12, 49, 196), (256, 1_024, 4_096))
     return Plan(False, threads, *sizes, seconds=1.0, least_rounds=3, most_rounds=30)
 
 
