@@ -6,7 +6,7 @@
 #   make format                    put formatting right
 #   make docs                      build the book into docs/_build/html; a warning is an error
 #   make bench                     speed of an update beside sb3-contrib's
-#   make bench-full                also speed of whole iterations, what the shipped settings reach, and peers (days)
+#   make bench-full                also speed of whole iterations and of each part, what the shipped settings reach, and peers (days)
 #   make clean                     remove .venv and what builds and tools left
 #   make PYTHON=python3.12 train   choose an interpreter
 
@@ -70,6 +70,10 @@ bench: $(STAMP)
 
 bench-full: bench $(TIANSHOU)/.installed
 	$(IN_VENV) python benchmarks/rollout_speed.py
+	$(IN_VENV) python -m benchmarks.speed run
+	$(IN_VENV) python -m benchmarks.speed profile
+	$(IN_VENV) python -m benchmarks.speed threads
+	$(IN_VENV) python -m benchmarks.speed report
 	$(IN_VENV) python benchmarks/first_results.py
 	$(IN_VENV) python benchmarks/paper_tasks.py
 	$(IN_VENV) python -m benchmarks.peers run --jobs 2

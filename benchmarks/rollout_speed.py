@@ -106,12 +106,16 @@ class Learner:
     def wholes(self) -> list[float]:
         return [rollout + update for rollout, update in zip(self.rollouts, self.updates, strict=True)]
 
-    def iterate(self) -> None:
-        model, start = self.model, time.perf_counter()
+    def collect(self) -> None:
+        model = self.model
         assert model.env is not None
         model.collect_rollouts(model.env, self._callback, model.rollout_buffer, model.n_steps)
+
+    def iterate(self) -> None:
+        start = time.perf_counter()
+        self.collect()
         collected = time.perf_counter()
-        model.train()
+        self.model.train()
         self.rollouts.append(collected - start)
         self.updates.append(time.perf_counter() - collected)
 
@@ -122,42 +126,53 @@ def make_learner(algorithm: type[OnPolicyAlgorithm], task: str, n_envs: int, bat
     return Learner(algorithm("MlpPolicy", env, gamma=0.995, gae_lambda=0.97, **kwargs))  # type: ignore[call-arg]
 
 
-def open_loop(env: MujocoVecEnv) -> Callable[[], float]:
-    """:return: steps a second of the physics alone, on the same model and threads, under random controls"""
+def open_loop(env: MujocoVecEnv, n_steps: int) -> Callable[[], None]:
+    """:return: takes so many steps of the physics alone, on the same model and threads, under random controls"""
     task, n_envs = env.task, env.num_envs
     env.reset()
     states, rng = env._physics.copy(), np.random.default_rng(0)
     bounds = task.model.actuator_ctrlrange
     controls = rng.uniform(bounds[:, 0], bounds[:, 1], (n_envs, OPEN_LOOP_STEPS * task.frame_skip, task.model.nu))
     pool = Rollout(nthread=env.n_threads if env.n_threads > 1 else 0)
+    pieces, rest = divmod(n_steps, OPEN_LOOP_STEPS)
+    controls_of_pieces = [controls] * pieces + ([controls[:, : rest * task.frame_skip].copy()] if rest else [])
 
-    def rate() -> float:
-        pieces = -(-BATCH // (n_envs * OPEN_LOOP_STEPS))
-        start = time.perf_counter()
-        for _ in range(pieces):
-            pool.rollout([task.model] * n_envs, env._datas, states, controls)
-        return pieces * n_envs * OPEN_LOOP_STEPS / (time.perf_counter() - start)
+    def steps() -> None:
+        for piece in controls_of_pieces:
+            pool.rollout([task.model] * n_envs, env._datas, states, piece)
 
-    return rate
+    return steps
 
 
-def random_actions(task: str, n_envs: int, n_threads: int) -> Callable[[], float]:
-    """:return: steps a second of EnvPool itself under random actions"""
+def random_actions(task: str, n_envs: int, n_threads: int, n_steps: int) -> Callable[[], None]:
+    """:return: takes so many steps of EnvPool itself under random actions"""
     import envpool
 
     pool = envpool.make_gymnasium(task, num_envs=n_envs, num_threads=n_threads)
     pool.reset()
     space = gym.make(task).action_space
     actions = np.stack([space.sample() for _ in range(n_envs)]).astype(np.float64)
-    n_steps = -(-BATCH // n_envs)
 
-    def rate() -> float:
-        start = time.perf_counter()
+    def steps() -> None:
         for step in range(n_steps):
             pool.step(np.roll(actions, step, axis=0))
-        return n_steps * n_envs / (time.perf_counter() - start)
 
-    return rate
+    return steps
+
+
+def rate(steps: Callable[[], None], n_steps: int) -> float:
+    """:return: how many of the steps are taken in a second"""
+    start = time.perf_counter()
+    steps()
+    return n_steps / (time.perf_counter() - start)
+
+
+def physics_alone(env: VecEnv, task: str, n_steps: int) -> Callable[[], None]:
+    """:return: takes so many steps of each environment of a batch, without all that is around the physics"""
+    base: Any = env.unwrapped
+    if isinstance(base, MujocoVecEnv):
+        return open_loop(base, n_steps)
+    return random_actions(task, base.num_envs, base.n_threads, n_steps)
 
 
 def physics_of(env: VecEnv) -> tuple[Any, tuple[str, ...]]:
@@ -170,11 +185,8 @@ def compare(task: Task, rounds: int) -> bool:
     ours = make_learner(TRPOGAE, task.env, task.n_envs, vec_env_cls=batched_vec_env)
     peers = {n_envs: make_learner(TRPO, task.env, n_envs) for n_envs in PEER_ENVS}
     assert ours.model.env is not None
-    base: Any = ours.model.env.unwrapped
-    is_ours = isinstance(base, MujocoVecEnv)
-    limit = open_loop(make_vec_env(task.env, task.n_envs, seed=0, vec_env_cls=MujocoVecEnv).unwrapped) if is_ours else (  # type: ignore[arg-type]
-        random_actions(task.env, task.n_envs, base.n_threads)
-    )  # fmt: skip
+    n_steps = -(-BATCH // task.n_envs)
+    limit = physics_alone(make_vec_env(task.env, task.n_envs, seed=0, vec_env_cls=batched_vec_env), task.env, n_steps)
     physics, policy = Meter(), Meter()
     owner, names = physics_of(ours.model.env)
     physics.watch(owner, *names)
@@ -182,7 +194,7 @@ def compare(task: Task, rounds: int) -> bool:
     policy.watch(ours.model.policy, "evaluate_actions", "predict_values")
     limits, shares = [], []
     for _ in range(rounds + 1):
-        limits.append(limit())
+        limits.append(rate(limit, n_steps * task.n_envs))
         physics.seconds = policy.seconds = 0.0
         ours.iterate()
         in_policy = policy.seconds

@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -76,19 +77,20 @@ class NoisyOscillators(gym.Env):
         return np.concatenate([self._state.real, self._state.imag])[:N_STATES].astype(np.float32)
 
 
-def ours(batch_size: int) -> TRPOGAE:
+def ours(batch_size: int, networks: dict[str, Any] = LOCOMOTION_NETWORKS) -> TRPOGAE:
     """A model that has collected one rollout and not yet learned from it."""
     env = make_vec_env(NoisyOscillators, N_ENVS, seed=0)
-    model = TRPOGAE("MlpPolicy", env, n_steps=batch_size // N_ENVS, policy_kwargs=LOCOMOTION_NETWORKS, seed=0, device="cpu")
+    model = TRPOGAE("MlpPolicy", env, n_steps=batch_size // N_ENVS, policy_kwargs=networks, seed=0, device="cpu")
     _, callback = model._setup_learn(batch_size)
     callback.on_training_start(locals(), globals())
     model.collect_rollouts(env, callback, model.rollout_buffer, model.n_steps)
     return model
 
 
-def theirs(model: TRPOGAE) -> TRPO:
-    """sb3-contrib's TRPO with its defaults, the same weights and the same rollout."""
-    peer = TRPO("MlpPolicy", model.env, n_steps=model.n_steps, policy_kwargs=LOCOMOTION_NETWORKS, seed=0, device="cpu")
+def theirs(model: TRPOGAE, **settings: Any) -> TRPO:
+    """sb3-contrib's TRPO with its defaults but for some settings, the same weights and the same rollout."""
+    networks = dict(model.policy_kwargs)
+    peer = TRPO("MlpPolicy", model.env, n_steps=model.n_steps, policy_kwargs=networks, seed=0, device="cpu", **settings)
     weights = model.policy.state_dict()
     peer.policy.load_state_dict({name: weights[name] for name in peer.policy.state_dict()})
     peer.set_logger(model.logger)
@@ -156,23 +158,31 @@ def compare_updates(batch_size: int, rounds: int) -> None:
     print(f"  ratio        median {statistics.median(ratios):6.1f}     (from {min(ratios):.1f} to {max(ratios):.1f})")
 
 
-def compare_advantages(batch_size: int, rounds: int) -> None:
+def random_rollout(kind: type[RolloutBuffer], batch_size: int, n_envs: int) -> RolloutBuffer:
+    """A full buffer of that kind, the same rewards and values in each, with its advantages computed."""
     spaces = NoisyOscillators.observation_space, NoisyOscillators.action_space
-    rng = np.random.default_rng(0)
+    rng, shape = np.random.default_rng(0), (batch_size // n_envs, n_envs)
+    buffer = kind(shape[0], *spaces, device="cpu", n_envs=n_envs)
+    for name in ("rewards", "values"):
+        setattr(buffer, name, rng.normal(size=shape).astype(np.float32))
+    buffer.episode_starts = (rng.random(shape) < 0.005).astype(np.float32)
+    buffer.full = True
+    compute_advantages(buffer)
+    return buffer
+
+
+def compute_advantages(buffer: RolloutBuffer) -> None:
+    """One pass over a full buffer."""
+    buffer.compute_returns_and_advantage(th.zeros(buffer.n_envs), np.zeros(buffer.n_envs, dtype=bool))
+
+
+def compare_advantages(batch_size: int, rounds: int) -> None:
     n_steps = batch_size // N_ENVS
-    buffers = [kind(n_steps, *spaces, device="cpu", n_envs=N_ENVS) for kind in (RolloutBuffer, GAERolloutBuffer)]
-    shape = (n_steps, N_ENVS)
-    arrays = {"rewards": rng.normal(size=shape), "values": rng.normal(size=shape), "episode_starts": rng.random(shape) < 0.005}
-    last_values, dones = th.zeros(N_ENVS), np.zeros(N_ENVS, dtype=bool)
-    for buffer in buffers:
-        for name, array in arrays.items():
-            setattr(buffer, name, array.astype(np.float32))
-        buffer.full = True
-        buffer.compute_returns_and_advantage(last_values, dones)
+    plain, kept_apart = (random_rollout(kind, batch_size, N_ENVS) for kind in (RolloutBuffer, GAERolloutBuffer))
     single, grid = [], []
     for _ in range(rounds + 1):
-        single.append(seconds(lambda: buffers[0].compute_returns_and_advantage(last_values, dones)))
-        grid.append(seconds(lambda: buffers[1].advantage_grid(GAMMAS, LAMBDAS)))
+        single.append(seconds(lambda: compute_advantages(plain)))
+        grid.append(seconds(lambda: kept_apart.advantage_grid(GAMMAS, LAMBDAS)))
     ratios = [b / a for a, b in zip(single[1:], grid[1:], strict=True)]
     print(f"Advantages, {n_steps} steps of {N_ENVS} environments, {rounds} rounds after one to warm up")
     print(f"  one pass of SB3's buffer          median {1e3 * statistics.median(single[1:]):6.1f} ms")

@@ -55,7 +55,7 @@ def options(words: list[str]) -> set[str]:
 
 def sources(module: str) -> str:
     """:return: all code of the package or module that ``python -m`` runs"""
-    top = importlib.util.find_spec(module.split(".")[0])
+    top = importlib.util.find_spec(module.split(".")[0].replace("pytest", "_pytest"))
     assert top is not None, f"there is no {module}"
     assert importlib.util.find_spec(module) is not None, f"there is no {module}"
     return "\n".join(

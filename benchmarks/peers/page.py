@@ -1,7 +1,7 @@
 """The results page: text by hand, and between markers what comes from the results."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from benchmarks.peers.errors import PeersError
 
@@ -20,3 +20,14 @@ def filled(page: str, sections: Mapping[str, str]) -> str:
         body = f"\n{content}\n\n" if content else ""
         page = between.sub(lambda match, body=body: match[1] + body + match[2], page)  # type: ignore[misc]
     return page
+
+
+def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """
+    :param heads: of the columns
+    :param rows: as many cells each
+    :return: nothing at all where there are no rows: a table without numbers would be read as one with
+    """
+    if not rows:
+        return ""
+    return "\n".join("| " + " | ".join(row) + " |" for row in (heads, ["---"] * len(heads), *rows))

@@ -1,7 +1,7 @@
 """Markdown of the results page."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import pandas as pd
 
@@ -17,6 +17,7 @@ from benchmarks.peers.comparison import (
     time_to_reach,
 )
 from benchmarks.peers.curves import Run, all_runs, runs_of, scores_of
+from benchmarks.peers.page import markdown_table
 from benchmarks.peers.plan import ABLATION_TASKS
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, PUBLISHED_PPO
 from benchmarks.peers.variants import VARIANTS
@@ -34,7 +35,7 @@ def scores_table(table: pd.DataFrame) -> str:
     runs = mujoco_runs(table)
     names = [name for name in ALGORITHMS if any(name in own for own in runs.values())]
     rows = [[task, *(_score(own.get(name)) for name in names)] for task, own in runs.items()]
-    return _markdown(["task", *(ALGORITHMS[name].title for name in names)], rows)
+    return markdown_table(["task", *(ALGORITHMS[name].title for name in names)], rows)
 
 
 def aggregate_table(table: pd.DataFrame) -> str:
@@ -54,7 +55,7 @@ def aggregate_table(table: pd.DataFrame) -> str:
         ]
         for name, mean in interquartile_means(scores).items()
     ]
-    return _markdown(["", "runs × tasks", "IQM", "probability that ours is better", "IQM of ours / its own"], rows)
+    return markdown_table(["", "runs × tasks", "IQM", "probability that ours is better", "IQM of ours / its own"], rows)
 
 
 def clock_table(table: pd.DataFrame) -> str:
@@ -73,7 +74,7 @@ def clock_table(table: pd.DataFrame) -> str:
         cells = [part for title, chance in zip(found, better, strict=True) for part in (_decimal(means[title][name]), chance)]
         rows.append([ALGORITHMS[name].title, *cells])
     heads = [head for title in FRACTIONS for head in (f"IQM after {title}", "ours is better")]
-    return _markdown(["", *heads], rows)
+    return markdown_table(["", *heads], rows)
 
 
 def reach_table(table: pd.DataFrame) -> str:
@@ -89,7 +90,7 @@ def reach_table(table: pd.DataFrame) -> str:
         part = f"{reach.part:.2f}" if math.isfinite(reach.part) else "–"
         rows.append([task, number(reach.target), steps, *times, part])
     heads = ["task", "TRPO's final return", "steps of ours", "ours", "TRPO, first time", "TRPO, whole training"]
-    return _markdown([*heads, "ours / whole training"], rows)
+    return markdown_table([*heads, "ours / whole training"], rows)
 
 
 def classic_table(table: pd.DataFrame) -> str:
@@ -102,7 +103,7 @@ def classic_table(table: pd.DataFrame) -> str:
         own = all_runs(table, task, steps)
         if OURS in own and TRPO in own:
             rows.append([task, number(steps), _score(own[OURS]), _score(own[TRPO]), verdict(own)])
-    return _markdown(["task", "steps", ALGORITHMS[OURS].title, ALGORITHMS[TRPO].title, "at least as good"], rows)
+    return markdown_table(["task", "steps", ALGORITHMS[OURS].title, ALGORITHMS[TRPO].title, "at least as good"], rows)
 
 
 def verdict(own: dict[str, list[Run]]) -> str:
@@ -126,7 +127,7 @@ def long_table(table: pd.DataFrame) -> str:
         if runs := runs_of(table, task, OURS, LONG_STEPS):
             above = "yes" if score(runs).point > published else "no"
             rows.append([task, _score(runs), number(published), above])
-    return _markdown(["task", ALGORITHMS[OURS].title, "PPO, as tianshou has published it", "above"], rows)
+    return markdown_table(["task", ALGORITHMS[OURS].title, "PPO, as tianshou has published it", "above"], rows)
 
 
 def ablation_table(table: pd.DataFrame) -> str:
@@ -140,7 +141,7 @@ def ablation_table(table: pd.DataFrame) -> str:
         own = {task: runs_of(table, task, OURS, MUJOCO_STEPS, variant) for task in ABLATION_TASKS}
         if any(own.values()) and all(shipped.values()):
             rows.append([about.title, *(_score(runs) for runs in own.values()), _against(own, shipped)])
-    return _markdown(["", *ABLATION_TASKS, "IQM over tasks, as shipped = 1"], rows if len(rows) > 1 else [])
+    return markdown_table(["", *ABLATION_TASKS, "IQM over tasks, as shipped = 1"], rows if len(rows) > 1 else [])
 
 
 def _against(own: dict[str, list[Run]], shipped: dict[str, list[Run]]) -> str:
@@ -167,7 +168,7 @@ def targets_table(table: pd.DataFrame) -> str:
         below = [task for task, value in found.items() if value <= PUBLISHED_PPO[task]]
         measured = ", ".join(f"{task} {number(value)}" for task, value in found.items())
         rows.append(["3 million steps: above tianshou's published PPO", measured, _met(not below)])
-    return _markdown(["target", "measured", "met"], rows)
+    return markdown_table(["target", "measured", "met"], rows)
 
 
 def _mujoco_targets(runs: Runs) -> Iterable[list[str]]:
@@ -227,10 +228,3 @@ def _seconds(value: float) -> str:
 
 def _met(is_met: bool) -> str:
     return "yes" if is_met else "**no**"
-
-
-def _markdown(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Nothing at all where there are no rows: a table without numbers would be read as one with."""
-    if not rows:
-        return ""
-    return "\n".join("| " + " | ".join(row) + " |" for row in (heads, ["---"] * len(heads), *rows))
