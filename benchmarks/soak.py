@@ -11,7 +11,6 @@ printed and makes the exit status 1.
 """
 
 import argparse
-import gc
 import os
 import sys
 import tempfile
@@ -27,6 +26,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gae import TRPOGAE, MujocoVecEnv, ResumableCheckpointCallback
+from sb3_gae.sweep.worker import return_freed_memory
 
 N_ENVS, N_STEPS, ITERATIONS_A_LIFE = 16, 64, 20
 # Of a whole life, over all the lives after the second, which the allocator takes to settle
@@ -109,8 +109,8 @@ def main(arguments: list[str]) -> int:
         while time.monotonic() < deadline:
             violations += live(Path(folder), deadline, counts)
             # A training that is over is a ring (a callback keeps `locals()` of the rollout, and so itself), which Python's
-            # collector, counting objects and not bytes, gets to after hundreds of lives
-            gc.collect()
+            # collector, counting objects and not bytes, gets to after hundreds of lives; and glibc keeps what was freed
+            return_freed_memory()
             used.append(resources())
             print(f"{counts['iterations']} iterations, {used[-1]}, {len(violations)} violations", flush=True)
     violations += leaks(used[2:])
