@@ -25,7 +25,11 @@ exclude_patterns = ["_build"]
 source_suffix = {".md": "markdown"}
 nitpicky = True
 # Names that autodoc finds behind NumPy's ArrayLike, and classes whose projects are not linked to
-nitpick_ignore = [("py:class", "VecEnv"), ("py:class", "collections.abc.Mapping[str")]
+nitpick_ignore = [
+    ("py:class", "VecEnv"),
+    ("py:class", "collections.abc.Mapping[str"),
+    ("py:class", "collections.abc.Callable[[]"),
+]
 nitpick_ignore_regex = [("py:class", r"numpy\._typing\..*|pandas\..*|optuna\..*|.*\._[A-Z]\w*")]
 
 myst_enable_extensions = ["colon_fence", "dollarmath", "fieldlist"]

@@ -89,6 +89,6 @@ def test_files_that_are_no_code_are_installed_too() -> None:
 
 
 def test_extras_exist() -> None:
-    assert {"tests", "docs", "fast", "lab", "ray", "sweep"} <= set(
+    assert {"tests", "docs", "fast", "lab", "postgresql", "ray", "sweep"} <= set(
         distribution("sb3-gae").metadata.get_all("Provides-Extra") or []
     )

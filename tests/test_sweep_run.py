@@ -208,6 +208,7 @@ def test_two_commands_share_a_grid() -> None:
         ({"env": "SweepTsk-v0"}, "did you mean 'SweepTask-v0'?"),
         ({"gym_packages": ["no_such_module"]}, "no_such_module cannot be imported"),
         ({"jobs": 0}, "`jobs` must be at least 1"),
+        ({"silent_after": 0.0}, "`silent_after` must be a number of seconds above 0"),
         ({"conf_file": "nowhere.yml"}, "no settings of SweepTask-v0 in nowhere.yml"),
         ({"hyperparams": {"n_step": 8}}, "did you mean 'n_steps'?"),
     ],

@@ -13,8 +13,10 @@ import pytest
 from optuna.trial import TrialState
 
 from sb3_gae.sweep import Cell, SweepError, SweepStudy
+from sb3_gae.sweep.errors import UnreachableError
 from sb3_gae.sweep.ledger import MAX_LOST, Outcome, Status
 from sb3_gae.sweep.liveness import sign_of_life, why_dead
+from sb3_gae.sweep.patience import Patience
 from sb3_gae.sweep.study import TakenOverError
 
 CELLS = [Cell("CartPole-v1", "trust_region", 0.9, value, 0, 3) for value in (0.0, 0.5, 1.0)]
@@ -116,6 +118,48 @@ def test_cells_of_a_dead_process_are_taken_over(journal: str) -> None:
         claim.append([ROW])
 
 
+def test_a_cell_that_another_process_gave_up_is_asked_for_again(location: str) -> None:
+    study = SweepStudy("s", location)
+    study.enqueue(CELLS[:1])
+    assert study.claim(CELLS[:1]) is not None
+    # Whoever gave it up is gone before it asks again, or has a grid without this cell
+    assert len(SweepStudy("s", location, silent_after=-1.0).take_back()) == 1
+    again = study.claim(CELLS[:1])
+    assert again is not None and again.cell == CELLS[0]
+
+
+def test_a_cell_that_is_lost_at_once_is_left_alone(journal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    study, other = SweepStudy("s", journal), SweepStudy("s", journal, silent_after=-1.0)
+    study.enqueue(CELLS[:2])
+    set_state = study.storage.set_trial_state_values
+
+    def set_state_and_lose(trial_id: int, state: TrialState) -> bool:
+        taken = set_state(trial_id, state)
+        if trial_id == 0:
+            other.take_back()
+        return taken
+
+    monkeypatch.setattr(study.storage, "set_trial_state_values", set_state_and_lose)
+    claim = study.claim(CELLS[:2])
+    assert claim is not None and claim.cell == CELLS[1]
+
+
+@pytest.mark.parametrize(
+    ("patience", "waits"), [(Patience(60.0, stop=lambda: True), False), (Patience(0.5), True), (Patience(), False)]
+)
+def test_patience_ends(patience: Patience, waits: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    tried = []
+
+    def fail() -> None:
+        tried.append(1)
+        raise UnreachableError("It is gone.")
+
+    with pytest.raises(UnreachableError, match=r"^It is gone\."):
+        patience(fail)
+    assert (len(tried) > 1) == waits
+    assert capsys.readouterr().err.count("\n") == waits, "what is waited for is said once"
+
+
 def test_a_cell_that_takes_its_process_along_counts_as_failed(journal: str) -> None:
     study = SweepStudy("s", journal, silent_after=-1.0)
     study.enqueue(CELLS[:1])
@@ -195,6 +239,11 @@ def test_other_formats_and_other_studies_are_refused(journal: str) -> None:
         ("sqlite:///{tmp}/nowhere/x.db", "cannot be reached"),
         ("sqlite:///{tmp}/file", "cannot be reached"),
         ("nosuchbase://host/x", "cannot be reached"),
+        ("nosuchbase://host/x?password=secret", "cannot be reached"),
+        ("postgres://me:secret@host/x", "PostgreSQL's is postgresql+psycopg://"),
+        ("postgresql+psycopg://me:top@secret@host/x", "inside a user or a password it is written %40"),
+        ("postgresql+psycopg://me:top:secret@host:a/x", "the port is a number"),
+        ("postgresql+asyncpg://me:secret@host/x", 'pip install "sb3-gae[postgresql]"'),
         ("mysql+pymysql://me:secret@localhost/x", "needs a driver that is not installed"),
     ],
 )

@@ -7,6 +7,7 @@ from rl_zoo3.utils import StoreDict
 
 from sb3_gae.sweep.conditions import CONDITIONS
 from sb3_gae.sweep.figures import KINDS
+from sb3_gae.sweep.liveness import SILENT_AFTER
 from sb3_gae.sweep.presets import PRESETS
 from sb3_gae.sweep.series import SCORES
 
@@ -72,6 +73,16 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--retry-failed", action="store_true", help="run cells that failed again")
     parser.add_argument("--dry-run", action="store_true", help="run nothing: what is left, and what it will cost")
     parser.add_argument("--no-progress", action="store_true", help="no progress bar")
+    parser.add_argument(
+        "--silent-after",
+        type=float,
+        default=SILENT_AFTER,
+        metavar="SECONDS",
+        help="without a sign of life, after which another machine's cell is taken over (default: %(default)g)",
+    )
+    parser.add_argument(
+        "--wait", action="store_true", help="stay while other machines run cells, and take over what they lose"
+    )
 
 
 def _add_figure(parser: argparse.ArgumentParser) -> None:

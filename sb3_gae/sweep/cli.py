@@ -45,10 +45,12 @@ def _run(args: argparse.Namespace) -> int:
     plan = _plan_of(args)
     if args.dry_run:
         return _dry_run(plan, args.jobs)
-    table = run_plan(plan, args.jobs, retry_failed=args.retry_failed, progress=not args.no_progress)
+    table = run_plan(plan, args.jobs, retry_failed=args.retry_failed, progress=not args.no_progress, wait=args.wait)
     print(overview(plan.name, table))
-    print(failures(table), end="")
     statuses = {standing.status for standing in table.values()}
+    if Status.RUNNING in statuses:
+        print(running(table) + "Other processes run these; --wait stays until they are done, and takes over what is lost.")
+    print(failures(table), end="")
     if Status.FAILED in statuses:
         return _FAILED_CELLS
     return _STOPPED if statuses & {Status.WAITING, Status.MISSING} else 0
@@ -70,7 +72,7 @@ def _plan_of(args: argparse.Namespace) -> Plan:
     )
     name = args.name or default_name(args.preset, (cell.task for cell in cells))
     options = Options(args.conf_file, tuple(args.gym_packages), args.threads, args.device)
-    return Plan(name, args.storage, tuple(cells), options)
+    return Plan(name, args.storage, tuple(cells), options, args.silent_after)
 
 
 def _dry_run(plan: Plan, jobs: int) -> int:

@@ -11,6 +11,22 @@ from typing import Any
 SILENT_AFTER = 900.0
 
 
+def beat_every(silent_after: float) -> float:
+    """
+    :param silent_after: seconds of silence after which a cell may be taken over
+    :return: seconds between signs of life, so many that some may be late
+    """
+    return silent_after / 15.0
+
+
+def patience_with(silent_after: float) -> float:
+    """
+    :param silent_after: seconds of silence after which a cell may be taken over
+    :return: seconds to wait for a storage; less, so that who goes on after an outage finds its cell still its own
+    """
+    return silent_after * 2.0 / 3.0
+
+
 def sign_of_life() -> dict[str, Any]:
     """
     :return: who and when, to be stored with a running cell; times in seconds since 1970

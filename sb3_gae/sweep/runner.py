@@ -9,6 +9,8 @@ from typing import Any
 
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.ledger import Standing, Status
+from sb3_gae.sweep.liveness import patience_with
+from sb3_gae.sweep.patience import Patience
 from sb3_gae.sweep.plan import Plan
 from sb3_gae.sweep.progress import Progress
 from sb3_gae.sweep.settings import check_overrides, check_tasks, import_packages, shipped_settings
@@ -34,7 +36,9 @@ def check_plan(plan: Plan) -> dict[str, dict[str, Any]]:
     return {task: shipped_settings(task, plan.options.conf_file) for task in tasks}
 
 
-def run_plan(plan: Plan, jobs: int = 1, *, retry_failed: bool = False, progress: bool = True) -> dict[str, Standing]:
+def run_plan(
+    plan: Plan, jobs: int = 1, *, retry_failed: bool = False, progress: bool = True, wait: bool = False
+) -> dict[str, Standing]:
     """
     Run what is not done, until nothing is left that this machine could run.
 
@@ -42,25 +46,32 @@ def run_plan(plan: Plan, jobs: int = 1, *, retry_failed: bool = False, progress:
     :param jobs: processes; with 1 the cells run in this one
     :param retry_failed: whether cells that failed are run again
     :param progress: whether to show a bar
+    :param wait: whether to stay while other processes run cells of the plan, for those that they lose
     :return: where each cell of the plan stands, by its key
     :raises SweepError: if something in the plan cannot be run, or the storage cannot be used
     """
     if jobs < 1:
         raise SweepError(f"`jobs` must be at least 1, got {jobs}.")
+    if not plan.silent_after > 0.0:
+        raise SweepError(f"`silent_after` must be a number of seconds above 0, got {plan.silent_after:g}.")
     settings = check_plan(plan)
-    study = SweepStudy(plan.name, plan.location, silent_after=plan.silent_after)
+    stop = StopRequest()
+    patience = Patience(patience_with(plan.silent_after), stop.is_set)
+    study = SweepStudy(plan.name, plan.location, silent_after=plan.silent_after, patience=patience)
     study.check_settings(settings)
     study.take_back()
     study.enqueue(plan.cells, retry_failed=retry_failed)
-    stop = StopRequest()
     # Only the main thread may
     handlers = stop.listen() if threading.current_thread() is threading.main_thread() else {}
     try:
         with Progress(study, plan.cells, show=progress) as bar:
-            if jobs == 1:
-                _run_here(plan, stop, bar)
-            else:
-                _Pool(plan, jobs).run(stop, bar)
+            is_left = True
+            while is_left:
+                if jobs == 1:
+                    _run_here(plan, stop, bar, patience)
+                else:
+                    _Pool(plan, jobs).run(stop, bar)
+                is_left = wait and _wait_for_others(study, plan, stop, bar)
     finally:
         stop.restore(handlers)
     if stop.reason and progress:
@@ -78,7 +89,19 @@ def standings_of(study: SweepStudy | None, plan: Plan) -> dict[str, Standing]:
     return {cell.key: table.get(cell.key, Standing(Status.MISSING, None, 0)) for cell in plan.cells}
 
 
-def _run_here(plan: Plan, stop: StopRequest, bar: Progress) -> None:
+def _wait_for_others(study: SweepStudy, plan: Plan, stop: StopRequest, bar: Progress) -> bool:
+    """:return: whether a cell is to be had again; False once all have ended, or if asked to stop"""
+    while not stop.is_set():
+        table = study.renew(plan.cells)
+        statuses = {table[cell.key].status for cell in plan.cells if cell.key in table}
+        if Status.WAITING in statuses or Status.RUNNING not in statuses:
+            return Status.WAITING in statuses
+        bar.show()
+        time.sleep(_LOOK_EVERY)
+    return False
+
+
+def _run_here(plan: Plan, stop: StopRequest, bar: Progress, patience: Patience) -> None:
     over = threading.Event()
 
     def show() -> None:
@@ -91,7 +114,7 @@ def _run_here(plan: Plan, stop: StopRequest, bar: Progress) -> None:
     shower = threading.Thread(target=show, daemon=True)
     shower.start()
     try:
-        work(plan, stop)
+        work(plan, stop, patience)
     finally:
         over.set()
         shower.join()

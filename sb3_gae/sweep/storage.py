@@ -1,6 +1,8 @@
 """Optuna's storages: opened by path or URL, safe for many processes, and with errors of one line."""
 
 import contextlib
+import random
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -8,12 +10,31 @@ from typing import Any
 import optuna
 import sqlalchemy
 from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import (
+    DBAPIError,
+    IntegrityError,
+    InterfaceError,
+    NoSuchModuleError,
+    OperationalError,
+    ProgrammingError,
+    SQLAlchemyError,
+)
 
-from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.errors import SweepError, UnreachableError
+from sb3_gae.sweep.location import is_server, is_url, parse_url, without_password
 
 #: seconds that a process waits for another one's write
 _LOCK_SECONDS = 60
+#: times that a database is opened while others make its tables
+_ATTEMPTS = 5
+#: of libpq, in seconds: a server that is cut off says nothing, and would be waited for by the hour
+_POSTGRESQL = {
+    "connect_timeout": 10,
+    "keepalives_idle": 30,
+    "keepalives_interval": 10,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 60_000,  # milliseconds
+}
 
 
 class _TidyLock(JournalFileSymlinkLock):
@@ -66,7 +87,7 @@ def open_storage(location: str, *, create: bool) -> optuna.storages.BaseStorage:
     :raises SweepError: if it cannot be reached, is locked, or is something else
     """
     with storage_errors(location):
-        if "://" in location:
+        if is_url(location):
             return _open_database(location)
         # Absolute: the lock is a symbolic link to the file, and a dangling one is never seen to grow old
         path = Path(location).absolute()
@@ -77,11 +98,32 @@ def open_storage(location: str, *, create: bool) -> optuna.storages.BaseStorage:
 
 
 def _open_database(url: str) -> optuna.storages.BaseStorage:
-    is_sqlite = sqlalchemy.make_url(url).get_backend_name() == "sqlite"
-    storage = optuna.storages.RDBStorage(url, engine_kwargs={"connect_args": {"timeout": _LOCK_SECONDS}} if is_sqlite else {})
-    if is_sqlite:
+    parsed = parse_url(url)
+    for attempt in range(_ATTEMPTS):
+        try:
+            storage = optuna.storages.RDBStorage(url, engine_kwargs=_engine_arguments(parsed))
+            break
+        except SQLAlchemyError as error:
+            # Machines that begin at the same moment all make the tables, and the database lets one of them
+            if attempt + 1 == _ATTEMPTS or not _may_be_made_already(error):
+                raise
+            time.sleep(random.uniform(0.05, 0.2))
+    if parsed.get_backend_name() == "sqlite":
         _begin_with_a_lock(storage.engine)
     return storage
+
+
+def _may_be_made_already(error: SQLAlchemyError) -> bool:
+    return isinstance(error, IntegrityError | ProgrammingError) or "already exists" in str(error)
+
+
+def _engine_arguments(url: sqlalchemy.URL) -> dict[str, Any]:
+    if url.get_backend_name() == "sqlite":
+        return {"connect_args": {"timeout": _LOCK_SECONDS}}
+    arguments: dict[str, Any] = {"pool_pre_ping": True}  # a connection that the server closed in the meantime is no error
+    if url.drivername in ("postgresql", "postgresql+psycopg", "postgresql+psycopg2"):
+        arguments["connect_args"] = {name: value for name, value in _POSTGRESQL.items() if name not in url.query}
+    return arguments
 
 
 def _begin_with_a_lock(engine: sqlalchemy.Engine) -> None:
@@ -109,39 +151,58 @@ def storage_errors(location: str) -> Iterator[None]:
     Say in one line what is wrong with a storage.
 
     :param location: its URL or path, for the message
-    :raises SweepError: in place of what Optuna, SQLAlchemy or the file system raise
+    :raises UnreachableError: in place of what a database raises whose server does not answer
+    :raises SweepError: in place of what else Optuna, SQLAlchemy or the file system raise
     """
     try:
         yield
     except (SweepError, optuna.exceptions.UpdateFinishedTrialError):
         raise
     except (OSError, SQLAlchemyError, ImportError, optuna.exceptions.OptunaError) as error:
-        raise SweepError(_explain(location, error)) from error
+        kind = UnreachableError if is_server(location) and _is_outage(error) else SweepError
+        raise kind(_explain(location, error)) from error
     except (ValueError, KeyError, TypeError, AssertionError) as error:
         # What reading a journal that is none ends in
         raise SweepError(_explain(location, error)) from error
 
 
+def _is_outage(error: Exception) -> bool:
+    return isinstance(_cause_of(error), OperationalError | InterfaceError)
+
+
+def _cause_of(error: BaseException) -> BaseException:
+    """What the database said, which Optuna wraps in a guess of its own."""
+    inner: BaseException | None = error
+    while inner is not None and not isinstance(inner, DBAPIError):
+        inner = inner.__cause__
+    return error if inner is None else inner
+
+
 def _explain(location: str, error: Exception) -> str:
-    where, what = without_password(location), " ".join(str(error).split()) or type(error).__name__
-    if "locked" in what:
-        return f"The storage {where} is locked by another program; wait for it, or pass another --storage. ({what[:200]})"
+    where, cause = without_password(location), _cause_of(error)
+    said = cause.orig if isinstance(cause, DBAPIError) and cause.orig is not None else cause
+    what = (" ".join(str(said).split()) or type(said).__name__)[:200].rstrip(".?")
+    if "locked" in what and not is_server(location):
+        return f"The storage {where} is locked by another program; wait for it, or pass another --storage. ({what})"
     if isinstance(error, ImportError):
-        return f"The storage {where} needs a driver that is not installed: {what[:200]}"
-    if isinstance(error, OSError | SQLAlchemyError):
-        return f"The storage {where} cannot be reached: {what[:200]}. Check the path or the URL, and that it can be written."
-    return f"The storage {where} is not one of Optuna's, or it is damaged ({what[:200]}); pass another --storage."
+        return f"The storage {where} needs a driver that is not installed{_driver_of(location)}: {what}"
+    if isinstance(cause, OSError | SQLAlchemyError):
+        return f"The storage {where} cannot be reached: {what}. {_advice(location, cause)}"
+    return f"The storage {where} is not one of Optuna's, or it is damaged ({what}); pass another --storage."
 
 
-def without_password(location: str) -> str:
-    """
-    :param location: URL or path of a storage
-    :return: the same, fit to be shown
-    """
-    try:
-        return sqlalchemy.make_url(location).render_as_string(hide_password=True) if "://" in location else location
-    except SQLAlchemyError:
-        return location.split("://", 1)[0] + "://..."
+def _driver_of(location: str) -> str:
+    if not location.startswith("postgresql"):
+        return ""
+    return ' (pip install "sb3-gae[postgresql]", and a URL that begins with postgresql+psycopg://)'
+
+
+def _advice(location: str, cause: BaseException) -> str:
+    if isinstance(cause, NoSuchModuleError):
+        return "Check how the URL begins: PostgreSQL's is postgresql+psycopg://."
+    if is_server(location):
+        return "Check that the server runs, the URL's host, port, user and database, and the password."
+    return "Check the path or the URL, and that it can be written."
 
 
 def holds(location: str, study: str) -> bool:
@@ -153,7 +214,7 @@ def holds(location: str, study: str) -> bool:
     :return: whether the storage is there and has the study
     :raises SweepError: if it cannot be reached
     """
-    if "://" not in location and not Path(location).exists():
+    if not is_url(location) and not Path(location).exists():
         return False
     with storage_errors(location):
         return study in optuna.get_all_study_names(open_storage(location, create=False))

@@ -1,13 +1,12 @@
 """A sweep as an Optuna study: cells are trials, shared by every process that opens the same storage."""
 
-import contextlib
 import datetime
 import math
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import Any, TypeVar
 
 import optuna
 from optuna.distributions import BaseDistribution, FloatDistribution, IntDistribution
@@ -17,8 +16,12 @@ from optuna.trial import FrozenTrial, TrialState
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Cell
 from sb3_gae.sweep.ledger import Outcome, Standing, Status, duplicates, standings
-from sb3_gae.sweep.liveness import SILENT_AFTER, sign_of_life, why_dead
-from sb3_gae.sweep.storage import open_storage, storage_errors, without_password
+from sb3_gae.sweep.liveness import SILENT_AFTER, beat_every, sign_of_life, why_dead
+from sb3_gae.sweep.location import without_password
+from sb3_gae.sweep.patience import Patience
+from sb3_gae.sweep.storage import open_storage, storage_errors
+
+_T = TypeVar("_T")
 
 #: of what is stored; another one is refused
 FORMAT = 1
@@ -41,23 +44,45 @@ class SweepStudy:
     :param location: path or URL of the storage; None for ``logs/sweeps/<name>.journal``
     :param create: whether to begin a sweep that is not there
     :param silent_after: seconds without a sign of life after which another machine's cell is taken over
+    :param patience: with a storage that does not answer any more, once it is open; None for none
     :raises SweepError: if the storage cannot be used, or holds something else
     """
 
-    def __init__(self, name: str, location: str | None = None, *, create: bool = True, silent_after: float = SILENT_AFTER):
+    def __init__(
+        self,
+        name: str,
+        location: str | None = None,
+        *,
+        create: bool = True,
+        silent_after: float = SILENT_AFTER,
+        patience: Patience | None = None,
+    ):
         self.name = name
         self.location = location or default_location(name)
         self.silent_after = silent_after
+        self._patience = Patience() if patience is None else patience
         # Optuna announces studies, and warns of what is only experimental
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.storage = open_storage(self.location, create=create)
-        with self.errors():
+        with storage_errors(self.location):
             self._study = self._open(create)
             self._study_id = self.storage.get_study_id_from_name(name)
 
-    def errors(self) -> contextlib.AbstractContextManager[None]:
-        """:return: a context in which errors of the storage are said in one line"""
-        return storage_errors(self.location)
+    def ask(self, operation: Callable[..., _T], *arguments: Any) -> _T:
+        """
+        Use the storage, with patience.
+
+        :param operation: of the storage; one that may be done twice
+        :param arguments: of it
+        :return: its result
+        :raises SweepError: in one line, if the storage cannot be used any more
+        """
+
+        def once() -> _T:
+            with storage_errors(self.location):
+                return operation(*arguments)
+
+        return self._patience(once)
 
     def _open(self, create: bool) -> optuna.Study:
         names = optuna.get_all_study_names(self.storage)
@@ -74,8 +99,10 @@ class SweepStudy:
         return study
 
     def _check_format(self, study: optuna.Study) -> None:
+        # In this order: whoever begins the sweep at this moment writes the format first
+        is_empty = not study.get_trials(deepcopy=False)
         found = study.user_attrs.get(_FORMAT_ATTRIBUTE)
-        if found is None and not study.get_trials(deepcopy=False):
+        if found is None and is_empty:
             study.set_user_attr(_FORMAT_ATTRIBUTE, FORMAT)  # begun by a process that did not get this far
         elif found != FORMAT:
             what = "is no sweep of sb3-gae" if found is None else f"is of format {found}, and this sb3-gae knows {FORMAT}"
@@ -84,8 +111,7 @@ class SweepStudy:
 
     def trials(self) -> list[FrozenTrial]:
         """:return: all of the study, not to be changed"""
-        with self.errors():
-            return self._study.get_trials(deepcopy=False)
+        return self.ask(self._study.get_trials, False)
 
     def standings(self) -> dict[str, Standing]:
         """:return: where each cell stands, by its key"""
@@ -98,19 +124,19 @@ class SweepStudy:
         :param settings: of each task, as the settings file has them
         :raises SweepError: if they are not those that the sweep began with
         """
-        with self.errors():
-            for task, now in settings.items():
-                before = self._study.user_attrs.get(f"settings:{task}")
-                if before is None:
-                    self._study.set_user_attr(f"settings:{task}", dict(now))
-                    continue
-                changed = [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
-                if changed:
-                    what = ", ".join(f"{name} {before.get(name)!r} -> {now.get(name)!r}" for name in changed)
-                    raise SweepError(
-                        f"The settings of {task} have changed since the sweep {self.name!r} began ({what}); "
-                        "choose another --name, or go back to them with --conf-file."
-                    )
+        stored = self.ask(lambda: self._study.user_attrs)
+        for task, now in settings.items():
+            before = stored.get(f"settings:{task}")
+            if before is None:
+                self.ask(self._study.set_user_attr, f"settings:{task}", dict(now))
+                continue
+            changed = [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
+            if changed:
+                what = ", ".join(f"{name} {before.get(name)!r} -> {now.get(name)!r}" for name in changed)
+                raise SweepError(
+                    f"The settings of {task} have changed since the sweep {self.name!r} began ({what}); "
+                    "choose another --name, or go back to them with --conf-file."
+                )
 
     def enqueue(self, cells: Iterable[Cell], *, retry_failed: bool = False) -> None:
         """
@@ -120,18 +146,16 @@ class SweepStudy:
         :param retry_failed: ask again for those that failed
         """
         table = self.standings()
-        with self.errors():
-            for cell in cells:
-                standing = table.get(cell.key)
-                again = standing is not None and (
-                    standing.status == Status.MISSING or (retry_failed and standing.status == Status.FAILED)
-                )
-                if standing is None or again:
-                    self.storage.create_new_trial(
-                        self._study_id, _template(cell, 0 if standing is None else standing.attempt + 1)
-                    )
-            for trial in duplicates(self.trials()):
-                self._end(trial, Outcome.DUPLICATE, "another trial of the same cell counts")
+        for cell in cells:
+            standing = table.get(cell.key)
+            again = standing is not None and (
+                standing.status == Status.MISSING or (retry_failed and standing.status == Status.FAILED)
+            )
+            if standing is None or again:
+                attempt = 0 if standing is None else standing.attempt + 1
+                self.ask(self.storage.create_new_trial, self._study_id, _template(cell, attempt))
+        for trial in duplicates(self.trials()):
+            self._end(trial, Outcome.DUPLICATE, "another trial of the same cell counts")
 
     def add_finished(self, cell: Cell, rows: Sequence[Mapping[str, float]], **what: Any) -> bool:
         """
@@ -150,32 +174,45 @@ class SweepStudy:
         trial.state, trial.value, trial.intermediate_values = TrialState.COMPLETE, _last_return(returns.values()), returns
         trial.datetime_start = trial.datetime_complete = datetime.datetime.now()
         trial.user_attrs |= what | {_rows_name(0): _columns(rows)}
-        with self.errors():
-            self.storage.create_new_trial(self._study_id, trial)
+        self.ask(self.storage.create_new_trial, self._study_id, trial)
         return True
 
     def claim(self, cells: Iterable[Cell]) -> "Claim | None":
         """
-        Take a cell that waits, which nobody else can take then; first see to those whose process is gone.
+        Take a cell that waits, which nobody else can take then; first see to those that were given up.
 
         :param cells: to choose from, in this order
         :return: the first that could be had, None if there is none
         """
         cells = list(cells)
-        if self.take_back():
-            self.enqueue(cells)
-        table = self.standings()
-        with self.errors():
-            for cell in cells:
-                standing = table.get(cell.key)
-                if standing is None or standing.status != Status.WAITING or standing.trial is None:
-                    continue
-                try:
-                    if self.storage.set_trial_state_values(self._id_of(standing.trial), TrialState.RUNNING):
-                        return Claim(self, cell, self._id_of(standing.trial))
-                except UpdateFinishedTrialError:
-                    continue
+        table = self.renew(cells)
+        for cell in cells:
+            standing = table.get(cell.key)
+            if standing is None or standing.status != Status.WAITING or standing.trial is None:
+                continue
+            trial_id = self._id_of(standing.trial)
+            try:
+                if self.ask(self.storage.set_trial_state_values, trial_id, TrialState.RUNNING):
+                    return Claim(self, cell, trial_id)
+            except (UpdateFinishedTrialError, TakenOverError):
+                continue
         return None
+
+    def renew(self, cells: Iterable[Cell]) -> dict[str, Standing]:
+        """
+        Ask again for cells that were given up, by this process or by another: whoever gave one up may be gone by now.
+
+        :param cells: of the grid
+        :return: where each cell of the study stands then, by its key
+        """
+        cells = list(cells)
+        self.take_back()
+        table = self.standings()
+        given_up = [cell for cell in cells if cell.key in table and table[cell.key].status == Status.MISSING]
+        if not given_up:
+            return table
+        self.enqueue(given_up)
+        return self.standings()
 
     def take_back(self) -> list[Standing]:
         """
@@ -195,15 +232,14 @@ class SweepStudy:
         """:return: whether it had not ended before"""
         trial_id = self._id_of(trial)
         try:
-            with self.errors():
-                self.storage.set_trial_user_attr(trial_id, "outcome", outcome)
-                self.storage.set_trial_user_attr(trial_id, "reason", reason)
-                return self.storage.set_trial_state_values(trial_id, TrialState.FAIL)
+            self.ask(self.storage.set_trial_user_attr, trial_id, "outcome", outcome)
+            self.ask(self.storage.set_trial_user_attr, trial_id, "reason", reason)
+            return self.ask(self.storage.set_trial_state_values, trial_id, TrialState.FAIL)
         except UpdateFinishedTrialError:
             return False
 
     def _id_of(self, trial: FrozenTrial) -> int:
-        return self.storage.get_trial_id_from_study_id_trial_number(self._study_id, trial.number)
+        return self.ask(self.storage.get_trial_id_from_study_id_trial_number, self._study_id, trial.number)
 
 
 class Claim:
@@ -217,6 +253,8 @@ class Claim:
 
     def __init__(self, sweep: SweepStudy, cell: Cell, trial_id: int):
         self.cell = cell
+        #: seconds between signs of life
+        self.beat_every = beat_every(sweep.silent_after)
         self._sweep, self._trial_id, self._n_chunks = sweep, trial_id, 0
         self.beat()
 
@@ -240,14 +278,12 @@ class Claim:
         self._set(_rows_name(self._n_chunks), _columns(rows))
         self._n_chunks += 1
         for row in rows:
-            with self._own():
-                self._sweep.storage.set_trial_intermediate_value(self._trial_id, int(row["iteration"]), row["mean_return"])
+            self._ask(self._sweep.storage.set_trial_intermediate_value, int(row["iteration"]), row["mean_return"])
         self.beat()
 
     def complete(self, value: float) -> None:
         """:param value: mean return of the last iteration that has one"""
-        with self._own():
-            self._sweep.storage.set_trial_state_values(self._trial_id, TrialState.COMPLETE, [value])
+        self._ask(self._sweep.storage.set_trial_state_values, TrialState.COMPLETE, [value])
 
     def give_up(self, outcome: Outcome, reason: str) -> None:
         """
@@ -255,19 +291,15 @@ class Claim:
         :param reason: the same in words
         """
         self.describe(outcome=outcome, reason=reason)
-        with self._own():
-            self._sweep.storage.set_trial_state_values(self._trial_id, TrialState.FAIL)
+        self._ask(self._sweep.storage.set_trial_state_values, TrialState.FAIL)
 
     def _set(self, name: str, value: Any) -> None:
-        with self._own():
-            self._sweep.storage.set_trial_user_attr(self._trial_id, name, value)
+        self._ask(self._sweep.storage.set_trial_user_attr, name, value)
 
-    @contextlib.contextmanager
-    def _own(self) -> Iterator[None]:
-        """A context in which a trial that has ended means that the cell is lost."""
+    def _ask(self, operation: Callable[..., Any], *arguments: Any) -> None:
+        """Use the storage; a trial that has ended means that the cell is lost."""
         try:
-            with self._sweep.errors():
-                yield
+            self._sweep.ask(operation, self._trial_id, *arguments)
         except UpdateFinishedTrialError as error:
             raise TakenOverError(str(error)) from error
 

@@ -7,6 +7,7 @@ from typing import Any
 import pandas as pd
 
 from sb3_gae.sweep.ledger import Status
+from sb3_gae.sweep.liveness import SILENT_AFTER
 from sb3_gae.sweep.plan import Options, Plan, default_name, make_cells
 from sb3_gae.sweep.results import results_of, rows_of_cells
 from sb3_gae.sweep.runner import run_plan
@@ -32,6 +33,8 @@ def run_sweep(
     gym_packages: Iterable[str] = (),
     retry_failed: bool = False,
     progress: bool = True,
+    silent_after: float = SILENT_AFTER,
+    wait: bool = False,
 ) -> pd.DataFrame:
     """
     Run the cells of a grid that are not done yet.
@@ -56,6 +59,9 @@ def run_sweep(
     :param gym_packages: modules that register environments
     :param retry_failed: whether cells that failed are run again
     :param progress: whether to show a bar
+    :param silent_after: seconds without a sign of life after which another machine's cell is taken over; signs are given
+        15 times as often
+    :param wait: whether to stay while other processes run cells of the grid, and take over those that they lose
     :return: a row for each iteration of each finished cell of the grid, as :func:`~sb3_gae.sweep.results.results_of`
     :raises SweepError: if an argument is wrong, or the storage cannot be used
     """
@@ -66,8 +72,9 @@ def run_sweep(
         storage,
         tuple(cells),
         Options(conf_file, tuple(gym_packages), threads, device),
+        silent_after,
     )
-    table = run_plan(plan, jobs, retry_failed=retry_failed, progress=progress)
+    table = run_plan(plan, jobs, retry_failed=retry_failed, progress=progress, wait=wait)
     for cell in cells:
         if table[cell.key].status == Status.FAILED:
             warnings.warn(f"{cell} failed: {table[cell.key].reason}", stacklevel=2)

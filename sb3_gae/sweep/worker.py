@@ -17,6 +17,8 @@ import torch as th
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.ledger import Outcome
+from sb3_gae.sweep.liveness import patience_with
+from sb3_gae.sweep.patience import Patience
 from sb3_gae.sweep.plan import Options, Plan
 from sb3_gae.sweep.provenance import provenance
 from sb3_gae.sweep.recorder import Row
@@ -25,8 +27,6 @@ from sb3_gae.sweep.study import Claim, SweepStudy, TakenOverError
 
 #: seconds between pieces of a learning curve: each costs a write that other processes wait for
 _STORE_EVERY = 5.0
-#: seconds between signs of life, far below what counts as silence
-_BEAT_EVERY = 60.0
 #: seconds that a cell must have taken for its memory to be worth a search
 _LONG_CELL = 30.0
 
@@ -70,18 +70,20 @@ class StopRequest:
         return bool(self.reason)
 
 
-def work(plan: Plan, stop: StopRequest) -> None:
+def work(plan: Plan, stop: StopRequest, patience: Patience) -> None:
     """
     Run cells until none waits.
 
     :param plan: what to run
     :param stop: asked at every step
+    :param patience: with a storage that does not answer
     :raises SweepError: if the storage cannot be used any more
     """
     n_threads = th.get_num_threads()
     th.set_num_threads(plan.options.threads)
     try:
-        study = SweepStudy(plan.name, plan.location, silent_after=plan.silent_after)
+        # The sweep has begun: that its storage does not answer may pass
+        study = patience(lambda: SweepStudy(plan.name, plan.location, silent_after=plan.silent_after, patience=patience))
         while not stop.is_set() and (claim := study.claim(plan.cells)) is not None:
             start = time.monotonic()
             run_claim(claim, plan.options, stop)
@@ -113,7 +115,7 @@ def work_as_process(plan: Plan, messages: Any) -> None:
     stop.listen()
     try:
         import_packages(plan.options.gym_packages)
-        work(plan, stop)
+        work(plan, stop, Patience(patience_with(plan.silent_after), stop.is_set))
     except SweepError as error:
         messages.put(str(error))
         raise SystemExit(2) from None
@@ -194,6 +196,6 @@ class _CurveWriter:
     def step(self) -> None:
         if self._stop.is_set():
             raise StoppedError
-        if time.monotonic() - self._beaten > _BEAT_EVERY:
+        if time.monotonic() - self._beaten > self._claim.beat_every:
             self._claim.beat()
             self._beaten = time.monotonic()
