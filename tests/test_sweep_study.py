@@ -192,7 +192,7 @@ def test_a_line_that_somebody_still_writes_is_not_cut(journal: str, monkeypatch:
 @pytest.mark.parametrize("create", [True, False])
 def test_a_file_that_is_no_journal_stays_as_it_is(content: str, create: bool, journal: str) -> None:
     Path(journal).write_text(content)
-    with pytest.raises(SweepError, match="sweep.journal") as error:
+    with pytest.raises(SweepError, match=r"sweep\.journal") as error:
         SweepStudy("s", journal, create=create)
     assert "\n" not in str(error.value)
     assert Path(journal).read_text() == content

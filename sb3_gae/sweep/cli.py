@@ -18,9 +18,10 @@ from sb3_gae.sweep.plan import Options, Plan, default_name, make_cells
 from sb3_gae.sweep.report import failures, overview, running
 from sb3_gae.sweep.results import NO_PARQUET, read_results, results_of, select
 from sb3_gae.sweep.runner import check_plan, run_plan, standings_of
+from sb3_gae.sweep.runs import combine, runs_of
 from sb3_gae.sweep.storage import holds
 from sb3_gae.sweep.study import SweepStudy, default_location
-from sb3_gae.sweep.take_in import runs_of, take_in
+from sb3_gae.sweep.take_in import take_in
 
 #: for the shell
 _FAILED_CELLS, _BAD_INPUT, _STOPPED = 1, 2, 130
@@ -158,7 +159,7 @@ def _results_of(args: argparse.Namespace) -> tuple[pd.DataFrame, str]:
 
 
 def _read(files: Sequence[str]) -> pd.DataFrame:
-    return pd.concat([read_results(file) for file in files], ignore_index=True)
+    return combine((file, read_results(file)) for file in files)
 
 
 def _study_of(args: argparse.Namespace) -> SweepStudy:

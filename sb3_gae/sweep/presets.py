@@ -103,5 +103,5 @@ def find_preset(name: str) -> Preset:
     :raises SweepError: if there is none of that name
     """
     if name not in PRESETS:
-        raise SweepError(f"`preset` knows {', '.join(PRESETS)}, got {name!r}{did_you_mean(name, PRESETS)}.")
+        raise SweepError(f"`preset` knows {', '.join(PRESETS)}, got {name!r}{did_you_mean(name, PRESETS)}")
     return PRESETS[name]

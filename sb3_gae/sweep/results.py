@@ -1,7 +1,6 @@
 """Results as a table: a row for each iteration of each finished cell, from a study or from an exported file."""
 
 import json
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,15 +8,15 @@ from typing import Any
 import pandas as pd
 from optuna.trial import FrozenTrial
 
+from sb3_gae.sweep.agreement import check_alike, made_in
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Cell
 from sb3_gae.sweep.ledger import Status
 from sb3_gae.sweep.provenance import PROVENANCE_COLUMNS
 from sb3_gae.sweep.recorder import COLUMNS as ROW_COLUMNS
+from sb3_gae.sweep.runs import CELL_COLUMNS, cell_of, check_runs
 from sb3_gae.sweep.study import FORMAT, SweepStudy
 
-#: what identifies a run
-CELL_COLUMNS = ("task", "condition", "gamma", "gae_lambda", "seed", "iterations", "overrides")
 _TEXT_COLUMNS = ("sweep", "task", "condition", "overrides", *PROVENANCE_COLUMNS, "settings")
 _COUNT_COLUMNS = ("format", "seed", "iterations", "iteration", "timesteps", "episodes", "trial")
 #: of the table and of exported files
@@ -55,7 +54,7 @@ def read_results(path: str | Path) -> pd.DataFrame:
     """
     :param path: of an exported ``.csv`` (perhaps compressed) or ``.parquet`` file
     :return: its table, with the columns of :data:`~sb3_gae.sweep.results.COLUMNS`
-    :raises SweepError: if there is no such file, it is something else, or another version wrote it
+    :raises SweepError: if there is no such file, it is something else, another version wrote it, or runs in it are not whole
     """
     path = Path(path)
     try:
@@ -74,7 +73,9 @@ def read_results(path: str | Path) -> pd.DataFrame:
         raise SweepError(f"{path} is of format {written}, and this sb3-gae knows {FORMAT}; export it anew from its storage.")
     if missing := [name for name in COLUMNS if name not in table]:
         raise SweepError(f"{path} lacks the columns {', '.join(missing)}; export it anew from its storage.")
-    return _typed(table)
+    table = _typed(table)
+    check_runs(table, str(path))
+    return table
 
 
 def _read_csv(path: Path) -> pd.DataFrame:
@@ -129,7 +130,7 @@ def select(
     :param gammas: to keep
     :param lambdas: to keep, beside cells of conditions without λ
     :param iterations: of the cells to keep
-    :return: one task's rows, with runs of one length and one set of overrides
+    :return: one task's rows, with runs of one length, one set of overrides, and one of settings
     :raises SweepError: if nothing is left, or several kinds are left that do not go together
     """
     if table.empty:
@@ -160,6 +161,7 @@ def select(
         if len(found) > 1:
             shown = ", ".join(map(_shown, found))
             raise SweepError(f"The selection mixes runs whose {column} differ ({shown}); choose one with {option}.")
+    check_alike(made_in(table), "leave out one of the files, or choose other --conditions, --gammas or --lambdas")
     return table
 
 
@@ -190,12 +192,3 @@ def rows_of_cells(table: pd.DataFrame, cells: Iterable[Cell]) -> pd.DataFrame:
     keys = {cell.key for cell in cells}
     own = [trial.trial for trial in trials.itertuples() if cell_of(trial).key in keys]
     return table[table["trial"].isin(own)].reset_index(drop=True)
-
-
-def cell_of(row: Any) -> Cell:
-    """
-    :param row: of a table of results
-    :return: the cell that it is of
-    """
-    gae_lambda = None if math.isnan(row.gae_lambda) else row.gae_lambda
-    return Cell(row.task, row.condition, row.gamma, gae_lambda, int(row.seed), int(row.iterations), row.overrides)

@@ -64,7 +64,7 @@ def check_tasks(tasks: Iterable[str]) -> None:
     for task in tasks:
         if task not in gymnasium.registry:
             raise SweepError(
-                f"`env`: gymnasium does not know {task!r}{did_you_mean(task, gymnasium.registry)}. "
+                f"`env`: gymnasium does not know {task!r}{did_you_mean(task, gymnasium.registry)} "
                 "Environments of your own come with --gym-packages."
             )
 
@@ -82,7 +82,7 @@ def check_overrides(cells: Iterable[Cell]) -> None:
             if name in find_condition(condition).settings:
                 raise SweepError(f"`-params {name}` is what the condition {condition!r} sets; leave out one of them.")
             if name not in known:
-                raise SweepError(f"`-params` has no {name!r}{did_you_mean(name, known)}.")
+                raise SweepError(f"`-params` has no {name!r}{did_you_mean(name, known)}")
 
 
 def shipped_settings(task: str, conf_file: str | None = None) -> dict[str, Any]:
