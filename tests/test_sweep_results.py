@@ -218,6 +218,8 @@ def test_figures_are_the_same_bit_for_bit(kind: str, table: pd.DataFrame, tmp_pa
         ("heatmap", {"iteration": 5}, "`iteration` must be from 1 to 4"),
         ("lambda", {}, "at one γ, and the selection has 0.9, 1"),
         ("lambda", {"gammas": [0.9], "lambdas": [0.5]}, "needs at least two λ"),
+        ("curves", {"output": "out.pdf"}, "`output` must end in .png or .svg, or have no ending for both, got 'out.pdf'"),
+        ("curves", {"output": "out.SVG"}, "`output` must end in .png or .svg"),
         ("pie", {}, "`figure` knows curves, heatmap, lambda"),
     ],
 )
@@ -225,7 +227,7 @@ def test_empty_and_mixed_selections(
     kind: str, arguments: dict[str, Any], message: str, table: pd.DataFrame, tmp_path: Path
 ) -> None:
     with pytest.raises(SweepError) as error:
-        draw(kind, table, tmp_path / "figure", **arguments)
+        draw(kind, table, tmp_path / arguments.pop("output", "figure"), **arguments)
     assert message in str(error.value) and "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
 

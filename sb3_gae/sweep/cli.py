@@ -14,7 +14,9 @@ from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.export import export
 from sb3_gae.sweep.figures import draw
 from sb3_gae.sweep.ledger import Status
-from sb3_gae.sweep.plan import Options, Plan, default_name, make_cells
+from sb3_gae.sweep.machine import check_jobs
+from sb3_gae.sweep.plan import Options, Plan, check_seeds, default_name, make_cells
+from sb3_gae.sweep.presets import find_preset
 from sb3_gae.sweep.report import failures, overview, running
 from sb3_gae.sweep.results import NO_PARQUET, read_results, results_of, select
 from sb3_gae.sweep.runner import check_plan, run_plan, standings_of
@@ -32,8 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: of the command line; None for those of this process
     :return: exit status: 0, or 1 if cells failed, 2 after bad input, 130 if it was stopped
     """
-    args = make_parser().parse_args(arguments)
     try:
+        args = make_parser().parse_args(arguments)
         return _COMMANDS[args.command](args)
     except SweepError as error:
         print(f"sb3_gae.sweep: {error}", file=sys.stderr)
@@ -43,6 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
+    check_jobs(args.jobs)
     plan = _plan_of(args)
     if args.dry_run:
         return _dry_run(plan, args.jobs)
@@ -56,7 +59,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _plan_of(args: argparse.Namespace) -> Plan:
-    seeds = None if args.seeds is None else range(args.first_seed, args.first_seed + args.seeds)
+    seeds = None if args.seeds is None else range(args.first_seed, args.first_seed + check_seeds(args.seeds))
     if seeds is None and args.first_seed:
         raise SweepError("`first-seed` needs --seeds, the number of them.")
     cells = make_cells(
@@ -104,7 +107,7 @@ def _status(args: argparse.Namespace) -> int:
     table = study.standings()
     print(overview(study.name, table))
     print(running(table), end="")
-    print(failures(table), end="")
+    print(failures(table, tracebacks=args.tracebacks), end="")
     return 0
 
 
@@ -167,6 +170,8 @@ def _study_of(args: argparse.Namespace) -> SweepStudy:
 
 
 def _name_of(args: argparse.Namespace) -> str:
+    if args.preset is not None:
+        find_preset(args.preset)
     if name := args.name or args.preset:
         return str(name)
     raise SweepError("Which sweep? Give its --name, or the --preset it was made of.")

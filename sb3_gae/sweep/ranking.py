@@ -29,11 +29,6 @@ class Rank(NamedTuple):
     last: Estimate
     behind: Estimate | None
 
-    @property
-    def is_worse(self) -> bool:
-        """Whether the best one is ahead by more than chance would explain: the interval of the difference is above 0."""
-        return self.behind is not None and bool(self.behind.low[0] > 0.0)
-
 
 def rank_curves(table: pd.DataFrame, iteration: int | None = None, by: str = "training") -> list[Rank]:
     """

@@ -3,12 +3,15 @@
 import contextlib
 import multiprocessing
 import queue
+import signal
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.ledger import Standing, Status
+from sb3_gae.sweep.machine import check_jobs, check_options
 from sb3_gae.sweep.plan import Plan
 from sb3_gae.sweep.progress import Progress
 from sb3_gae.sweep.settings import check_overrides, check_tasks, import_packages, shipped_settings
@@ -27,6 +30,7 @@ def check_plan(plan: Plan) -> dict[str, dict[str, Any]]:
     :return: the settings of each task, without overrides
     :raises SweepError: if something in it cannot be run
     """
+    check_options(plan.options)
     import_packages(plan.options.gym_packages)
     tasks = list(dict.fromkeys(cell.task for cell in plan.cells))
     check_tasks(tasks)
@@ -45,8 +49,7 @@ def run_plan(plan: Plan, jobs: int = 1, *, retry_failed: bool = False, progress:
     :return: where each cell of the plan stands, by its key
     :raises SweepError: if something in the plan cannot be run, or the storage cannot be used
     """
-    if jobs < 1:
-        raise SweepError(f"`jobs` must be at least 1, got {jobs}.")
+    check_jobs(jobs)
     settings = check_plan(plan)
     study = SweepStudy(plan.name, plan.location, silent_after=plan.silent_after)
     study.check_settings(settings)
@@ -97,6 +100,23 @@ def _run_here(plan: Plan, stop: StopRequest, bar: Progress) -> None:
         shower.join()
 
 
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """
+    Processes that are started here never hear of Ctrl-C, which comes to all at a terminal; they are asked to stop.
+
+    They would be interrupted while they still import. This process hears of it afterwards.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class _Pool:
     """
     Processes that each run one cell after another.
@@ -114,7 +134,8 @@ class _Pool:
 
     def _start(self) -> Any:
         process = self._context.Process(target=work_as_process, args=(self._plan, self._messages), daemon=True)
-        process.start()
+        with _without_interrupts():
+            process.start()
         return process
 
     def run(self, stop: StopRequest, bar: Progress) -> None:

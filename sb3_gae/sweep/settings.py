@@ -52,8 +52,15 @@ def import_packages(gym_packages: Iterable[str]) -> None:
             importlib.import_module(name)
         except ImportError as error:
             raise SweepError(
-                f"`gym_packages`: {name} cannot be imported ({error}); run where it lies, or install it."
+                f"`gym_packages`: {name} cannot be imported ({_in_one_line(error)}); run where it lies, or install it."
             ) from error
+        except Exception as error:
+            what = f"{type(error).__name__}: {_in_one_line(error)}"
+            raise SweepError(f"`gym_packages`: {name} fails when it is imported ({what}); mend it first.") from error
+
+
+def _in_one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
 
 
 def check_tasks(tasks: Iterable[str]) -> None:
