@@ -6,7 +6,7 @@ import pytest
 
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Curve
-from sb3_gae.sweep.ranking import Rank, as_markdown, rank_curves
+from sb3_gae.sweep.ranking import Rank, as_markdown, caution, rank_curves
 from sb3_gae.sweep.statistics import difference, interquartile_mean
 
 ITERATIONS = 4
@@ -78,6 +78,13 @@ def test_as_a_table(returns: dict[Curve, np.ndarray]) -> None:
     assert len({line.count("|") for line in lines}) == 1 and len(lines) == 5
     assert lines[2].startswith("| value function by trust region | 0.9 | 0.5 | 9 | 30.0 [")
     assert lines[2].endswith("|  |") and lines[-1].startswith("| no value function | 0.9 |  | 9 | 1.")
+
+
+@pytest.mark.parametrize("few", [4, 5])
+def test_intervals_of_few_seeds_come_with_a_caution(returns: dict[Curve, np.ndarray], few: int) -> None:
+    returns[Curve(0.9, 0.5)] = returns[Curve(0.9, 0.5)][:few]
+    said = caution(rank_curves(table_of(returns)))
+    assert said == ("With fewer than 5 seeds the intervals are too narrow to tell chance." if few < 5 else "")
 
 
 def test_what_it_does_not_know(returns: dict[Curve, np.ndarray]) -> None:

@@ -17,7 +17,7 @@ from sb3_gae.sweep.figures.curves import curves_figure
 from sb3_gae.sweep.figures.heatmap import heatmap_figure
 from sb3_gae.sweep.figures.lambda_curve import lambda_figure
 from sb3_gae.sweep.grid import cells_of, product
-from sb3_gae.sweep.ledger import Status
+from sb3_gae.sweep.ledger import Outcome, Status
 from sb3_gae.sweep.provenance import provenance
 from sb3_gae.sweep.recorder import COLUMNS
 from sb3_gae.sweep.results import COLUMNS as COLUMNS_OF_TABLE
@@ -176,6 +176,28 @@ def test_curves_have_a_band_and_a_legend(table: pd.DataFrame) -> None:
     assert all(text in shown for text in ("γ = 0.9, λ = 0.5", "no value function", "5 seeds", "iteration (batch)"))
 
 
+def test_few_runs_have_a_mean(table: pd.DataFrame) -> None:
+    chosen = select(table, gammas=[0.9])
+    for count, shown in ((4, "IQM over 4 seeds"), (3, "mean over 3 seeds"), (1, "mean over 1 seed,")):
+        some = chosen[chosen["seed"] < count]
+        assert shown in texts(curves_figure(some)) and shown in texts(lambda_figure(some))
+    assert "(mean)" in texts(heatmap_figure(chosen[chosen["seed"] < 3])) and "(IQM)" in texts(heatmap_figure(chosen))
+    mixed = chosen[(chosen["seed"] < 3) | (chosen["gae_lambda"] == 0.5)]
+    assert "IQM over 3 to 5 seeds (of fewer than 4 the mean)" in texts(curves_figure(mixed))
+
+
+def test_curves_say_where_episodes_ended_if_that_is_rare(table: pd.DataFrame) -> None:
+    chosen = select(table, gammas=[0.9], lambdas=[0.5], conditions=["trust_region"])
+    figure = curves_figure(chosen)  # in three iterations of four
+    assert figure.axes[0].lines[0].get_marker() == "None" and "dots" not in texts(figure)
+    rare = chosen.assign(mean_return=chosen["mean_return"].where(chosen["iteration"] == 3))
+    figure = curves_figure(rare)
+    (line,) = figure.axes[0].lines
+    assert line.get_marker() == "o" and "dots: episodes ended" in texts(figure)
+    marked = np.asarray(line.get_xdata())[line.get_markevery()]  # type: ignore[index]
+    assert marked.tolist() == [3]
+
+
 def test_heatmap_frames_the_best_cell(table: pd.DataFrame) -> None:
     figure = heatmap_figure(select(table, conditions=["trust_region"]))
     axes = figure.axes[0]
@@ -243,6 +265,54 @@ def test_runs_of_different_lengths_are_not_mixed(table: pd.DataFrame, tmp_path: 
 
 def test_rows_of_some_cells(table: pd.DataFrame) -> None:
     assert sorted(rows_of_cells(table, CELLS[:2])["trial"].unique()) == [0, 1]
+
+
+# --- What is not finished ---
+
+
+@pytest.fixture
+def unfinished(tmp_path: Path) -> SweepStudy:
+    """Cells that are done, failed, stopped and begun anew, lost, running and waiting."""
+    study = SweepStudy("s", str(tmp_path / "s.journal"))
+    cells = CELLS[:6]
+    fill(study, cells[:1])
+    study.enqueue(cells)
+    for cell, outcome in zip(cells[1:4], (Outcome.FAILED, Outcome.STOPPED, Outcome.LOST), strict=True):
+        claim = study.claim([cell])
+        assert claim is not None
+        claim.append([dict.fromkeys(COLUMNS, 1.0) | {"iteration": number} for number in (1.0, 2.0)])
+        claim.give_up(outcome, "")
+    study.enqueue(cells[2:3])
+    claim = study.claim(cells[4:5])
+    assert claim is not None
+    claim.append([dict.fromkeys(COLUMNS, 1.0)])
+    return study
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_is_not_finished_is_exported_if_asked_for(
+    suffix: str, unfinished: SweepStudy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+    path = tmp_path / f"partial{suffix}"
+    export_command = ["export", "--name", "s", "--storage", unfinished.location, "-o", str(path)]
+    assert main([*export_command, "--partial"]) == 0
+    assert "11 rows, 5 runs" in capsys.readouterr().out
+    table = read_results(path, partial=True)
+    pd.testing.assert_frame_equal(table, results_of(unfinished, partial=True))
+    counts = {"done": 4, "failed": 2, "stopped": 2, "lost": 2, "running": 1}
+    assert table["state"].value_counts().to_dict() == counts
+    # All else takes the finished cell alone
+    finished = results_of(unfinished)
+    assert "state" not in finished and len(finished) == 4
+    pd.testing.assert_frame_equal(read_results(path), finished)
+    pd.testing.assert_frame_equal(select(table), finished)
+    assert take_in(SweepStudy("other", str(tmp_path / "other.journal")), table) == 1
+    # Nor is it lost
+    said = refusal(*export_command, capsys=capsys)
+    assert "has runs that are not finished, too; pass --partial, or name another file" in said
+    assert main([*export_command, "--partial"]) == 0
 
 
 # --- What does not go together ---

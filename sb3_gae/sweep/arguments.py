@@ -59,6 +59,12 @@ def make_parser() -> argparse.ArgumentParser:
     exported = commands.add_parser("export", help="results as CSV and Parquet, a row for each seed and iteration")
     _add_study(exported)
     exported.add_argument("-o", "--output", nargs="+", help="files (default: logs/sweeps/NAME.csv and .parquet)")
+    exported.add_argument(
+        "--partial",
+        action="store_true",
+        help="also what is stored of cells that run, failed, were stopped or lost, with a column `state`; "
+        "figures, rank and import take only the finished cells of such a file",
+    )
     taken_in = commands.add_parser("import", help="add the finished cells of exported files to a sweep")
     taken_in.add_argument("files", nargs="+", metavar="FILE", help="CSV or Parquet")
     _add_study(taken_in)

@@ -113,15 +113,16 @@ def _status(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     study = _study_of(args)
-    table = results_of(study)
+    table = results_of(study, partial=args.partial)
     outputs = args.output
     if outputs is None:
         outputs = [f"logs/sweeps/{study.name}.csv", f"logs/sweeps/{study.name}.parquet"]
         if importlib.util.find_spec("pyarrow") is None:
             print(f"no Parquet file: {NO_PARQUET}", file=sys.stderr)
             outputs.pop()
+    of_runs = "runs" if args.partial else "cells"
     for output in outputs:
-        print(f"wrote {export(table, output)}: {len(table)} rows, {table['trial'].nunique()} cells")
+        print(f"wrote {export(table, output)}: {len(table)} rows, {table['trial'].nunique()} {of_runs}")
     return 0
 
 
@@ -145,9 +146,13 @@ def _rank(args: argparse.Namespace) -> int:
     table, _ = _results_of(args)
     chosen = select(table, **selection_of(args))
     # Every process of a sweep would wait for rliable
-    from sb3_gae.sweep.ranking import as_markdown, rank_curves
+    from sb3_gae.sweep.ranking import as_markdown, caution, rank_curves
 
-    print(as_markdown(rank_curves(chosen, args.iteration, args.by)))
+    ranks = rank_curves(chosen, args.iteration, args.by)
+    print(as_markdown(ranks))
+    # Not into the table, which may go into a document
+    if warning := caution(ranks):
+        print(warning, file=sys.stderr)
     return 0
 
 

@@ -10,10 +10,13 @@ import pandas as pd
 from sb3_gae.sweep.conditions import CONDITIONS, did_you_mean
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Cell
+from sb3_gae.sweep.ledger import Status
 from sb3_gae.sweep.recorder import COLUMNS as ROW_COLUMNS
 
 #: what a run is of
 CELL_COLUMNS = ("task", "condition", "gamma", "gae_lambda", "seed", "iterations", "overrides")
+#: of partial results
+STATE_COLUMN = "state"
 # The number of a trial names a run only within its sweep, and two machines may give both the same name
 _RUN_COLUMNS = [*CELL_COLUMNS, "sweep", "trial"]
 # What a run that is made again has in common with the first
@@ -36,6 +39,16 @@ def runs_of(table: pd.DataFrame) -> Iterator[pd.DataFrame]:
     """
     for _, rows in table.groupby(_RUN_COLUMNS, sort=False, dropna=False):
         yield rows
+
+
+def finished(table: pd.DataFrame) -> pd.DataFrame:
+    """
+    :param table: of results, perhaps partial
+    :return: the same without runs that are not finished, and without the column that tells them apart
+    """
+    if STATE_COLUMN not in table:
+        return table
+    return table[table[STATE_COLUMN] == Status.DONE].drop(columns=STATE_COLUMN).reset_index(drop=True)
 
 
 def check_runs(table: pd.DataFrame, where: str) -> None:

@@ -17,11 +17,14 @@ SCORES = ("last", "training")
 class Series(NamedTuple):
     """
     :param curve: what the runs have in common
-    :param returns: mean return of the episodes of each iteration, shape (seeds, iterations)
+    :param returns: mean return of the episodes of each iteration, shape (seeds, iterations); the last known one where none
+        ended
+    :param ended: whether episodes ended in the iteration, shape (seeds, iterations)
     """
 
     curve: Curve
     returns: np.ndarray
+    ended: np.ndarray
 
     @property
     def n_seeds(self) -> int:
@@ -45,7 +48,8 @@ def series_of(table: pd.DataFrame) -> list[Series]:
         wide = rows.pivot(index="seed", columns="iteration", values="mean_return")
         # In some batches no episode ends; the last known return stands for them
         returns = wide.ffill(axis="columns").to_numpy()
-        found.append(Series(Curve(gamma, None if math.isnan(gae_lambda) else gae_lambda, condition), returns))
+        curve = Curve(gamma, None if math.isnan(gae_lambda) else gae_lambda, condition)
+        found.append(Series(curve, returns, wide.notna().to_numpy()))
     names = list(CONDITIONS)
     without_vf_first = {name: (CONDITIONS[name].uses_lambda, names.index(name)) for name in names}
     return sorted(

@@ -10,7 +10,7 @@ import pandas as pd
 from sb3_gae.sweep.agreement import check_alike, check_made_with, made_in
 from sb3_gae.sweep.provenance import PROVENANCE_COLUMNS
 from sb3_gae.sweep.recorder import COLUMNS as ROW_COLUMNS
-from sb3_gae.sweep.runs import cell_of, check_runs, runs_of
+from sb3_gae.sweep.runs import cell_of, check_runs, finished, runs_of
 from sb3_gae.sweep.study import SweepStudy
 
 _ADVICE = "import them into a sweep of another --name"
@@ -25,6 +25,7 @@ def take_in(study: SweepStudy, table: pd.DataFrame) -> int:
     :return: number of cells that were added
     :raises SweepError: if runs are not whole or have other settings than the sweep, or the storage cannot be used
     """
+    table = finished(table)
     check_runs(table, "The table")
     made = made_in(table)
     check_made_with(made, study.task_settings(), _ADVICE)
