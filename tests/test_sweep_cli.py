@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from sb3_gae.sweep.arguments import make_parser
 from sb3_gae.sweep.cli import main
 
 RUN = ["run", "--env", "CartPole-v1", "--lambdas", "0", "1", "--iterations", "2", "--no-progress"]
@@ -38,7 +39,9 @@ def test_from_a_dry_run_to_figures(capsys: pytest.CaptureFixture[str]) -> None:
     assert Path("logs/sweeps/results_lambda.png").exists() and Path("figures/curves.svg").exists()
     capsys.readouterr()
     assert main(["rank", "--from", "results.csv", "--lambdas", "1", "--by", "last"]) == 0
-    assert "| value function by trust region | 0.9 | 1 | 2 |" in capsys.readouterr().out
+    said, warned = capsys.readouterr()
+    assert "| value function by trust region | 0.9 | 1 | 2 |" in said and "narrow" not in said
+    assert warned == "With fewer than 5 seeds the intervals are too narrow to tell chance.\n"
 
 
 def test_results_of_several_sweeps_go_into_one_table(capsys: pytest.CaptureFixture[str]) -> None:
@@ -58,7 +61,12 @@ def test_cells_that_fail_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(grid) == 1
     said = capsys.readouterr().out
     assert "failed: CartPole-v1, trust_region, γ = 0.9, λ = 0, seed 0, 2 iterations: ValueError: A batch needs" in said
-    assert "--retry-failed" in said
+    assert "--retry-failed; see their tracebacks with status --tracebacks" in said and "Traceback" not in said
+    assert main(["status", "--name", "CartPole-v1"]) == 0
+    assert "Traceback" not in capsys.readouterr().out
+    assert main(["status", "--name", "CartPole-v1", "--tracebacks"]) == 0
+    said = capsys.readouterr().out
+    assert said.count("Traceback (most recent call last):") == 2 and "in setup_experiment" in said
 
 
 @pytest.mark.parametrize(
@@ -67,6 +75,19 @@ def test_cells_that_fail_are_told(capsys: pytest.CaptureFixture[str]) -> None:
         ([*RUN, "--gammas", "1.5", "--seeds", "1"], "`gamma` must be a number in [0, 1], got 1.5"),
         ([*RUN, "--gammas", "1", "--seeds", "1", "--env", "CartPol-v1"], "did you mean 'CartPole-v1'?"),
         ([*RUN, "--gammas", "1"], "`seeds` is missing"),
+        ([*RUN, "--gammas", "1", "--seeds", "-1"], "`seeds` must be at least 1, got -1"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "--jobs", "0"], "`jobs` must be a whole number of at least 1, got 0"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "--dry-run", "--jobs", "0"], "`jobs` must be a whole number"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "--threads", "0"], "`threads` must be a whole number of at least 1"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "--device", "foo"], "`device`: PyTorch cannot use 'foo' here"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "--device", "cpu:x"], "`device`: PyTorch cannot use 'cpu:x' here"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "-params", "vf_steps:foo"], "`-params vf_steps` must be a value in Python"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "-params", "vf_steps"], "written as name:value, got 'vf_steps'"),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "-params", "vf_steps:"], "written as name:value, got 'vf_steps:'"),
+        (["run", "--env", "CartPole-v1", "--gammas", "1", "--seeds", "1", "--iterations", "1"], "`lambdas` is missing"),
+        (["run", "--preset", "small", "--iterations", "0"], "`iterations` must be a whole number of at least 1, got 0"),
+        (["status", "--preset", "nopreset"], "`preset` knows fig2-left, "),
+        (["status", "--name", "s", "--storage", "sqlite:///s.db"], "There is no sweep at sqlite:///s.db"),
         ([*RUN, "--gammas", "1", "--first-seed", "4"], "`first-seed` needs --seeds"),
         ([*RUN, "--gammas", "1", "--seeds", "1", "--storage", "file/x.journal"], "cannot be reached"),
         ([*RUN, "--gammas", "1", "--seeds", "1", "--conditions", "none"], "`conditions` knows"),
@@ -84,6 +105,29 @@ def test_errors_are_one_line(arguments: list[str], message: str, capsys: pytest.
     said = capsys.readouterr().err
     assert message in said and said.startswith("sb3_gae.sweep: ") and said.count("\n") == 1
     assert [path.name for path in Path().iterdir()] == ["file"]
+
+
+def test_params_of_several_kinds_are_read() -> None:
+    args = make_parser().parse_args([*RUN, "-params", "vf_steps:3", "name:'a:b'", "policy_kwargs:dict(a=[1])"])
+    assert args.hyperparams == {"vf_steps": 3, "name": "a:b", "policy_kwargs": {"a": [1]}}
+
+
+def test_a_package_that_fails_is_told_in_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "half_done.py").write_text("raise RuntimeError('not\\nyet')")
+    monkeypatch.syspath_prepend(str(folder))
+    assert main([*RUN, "--gammas", "1", "--seeds", "1", "--gym-packages", "half_done"]) == 2
+    said = capsys.readouterr().err
+    assert "`gym_packages`: half_done fails when it is imported (RuntimeError: not yet); mend it first." in said
+    assert said.count("\n") == 1 and not Path("logs").exists()
+
+
+def test_a_dry_run_makes_no_database(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid = [*RUN, "--gammas", "1", "--seeds", "1", "--storage", "sqlite:///s.db", *TINY, "--dry-run"]
+    assert main(grid) == 0
+    assert "2 cells, 0 done, 2 left" in capsys.readouterr().out
+    assert not list(folder.iterdir())
 
 
 def test_help_names_presets_and_conditions(capsys: pytest.CaptureFixture[str]) -> None:

@@ -108,9 +108,11 @@ def test_names_are_fit_for_files() -> None:
         ({"gammas": [1.1]}, "`gamma` must be a number in [0, 1], got 1.1"),
         ({"lambdas": [-0.5]}, "`gae_lambda` must be a number in [0, 1], got -0.5"),
         ({"lambdas": [float("nan")]}, "`gae_lambda` must be a number in [0, 1], got nan"),
-        ({"lambdas": []}, "`gae_lambda` must be a number in [0, 1], got None"),
+        ({"lambdas": []}, "`lambdas` is missing, of which the condition 'trust_region' needs at least one"),
+        ({"lambdas": None, "conditions": ["no_vf", "adam"]}, "`lambdas` is missing, of which the condition 'adam'"),
         ({"gammas": []}, "The grid is empty"),
-        ({"seeds": 0}, "The grid is empty"),
+        ({"seeds": 0}, "`seeds` must be at least 1, got 0"),
+        ({"seeds": []}, "The grid is empty"),
         ({"seeds": [-1]}, "`seeds` must be a whole number of at least 0"),
         ({"iterations": 0}, "`iterations` must be a whole number of at least 1"),
         ({"conditions": ["adm"]}, "did you mean 'adam'?"),
@@ -129,8 +131,10 @@ def test_bad_grids_are_refused(grid: dict[str, Any], message: str) -> None:
 def test_a_preset_has_its_own_curves() -> None:
     with pytest.raises(SweepError, match="`gammas` belongs to the preset"):
         make_cells("small", gammas=[0.9])
-    with pytest.raises(SweepError, match="did you mean 'small'"):
+    with pytest.raises(SweepError, match=r"got 'smal'; did you mean 'small'\?$"):
         make_cells("smal")
+    with pytest.raises(SweepError, match="`iterations` must be a whole number of at least 1, got 0"):
+        make_cells("small", iterations=0)
 
 
 @pytest.mark.parametrize(

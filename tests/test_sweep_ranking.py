@@ -6,7 +6,7 @@ import pytest
 
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Curve
-from sb3_gae.sweep.ranking import as_markdown, rank_curves
+from sb3_gae.sweep.ranking import Rank, as_markdown, caution, rank_curves
 from sb3_gae.sweep.statistics import difference, interquartile_mean
 
 ITERATIONS = 4
@@ -22,6 +22,11 @@ def table_of(returns: dict[Curve, np.ndarray]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["condition", "gamma", "gae_lambda", "seed", "iteration", "mean_return"])
 
 
+def is_behind(rank: Rank) -> bool:
+    """By more than chance would explain."""
+    return rank.behind is not None and bool(rank.behind.low[0] > 0.0)
+
+
 @pytest.fixture
 def returns() -> dict[Curve, np.ndarray]:
     noise = np.random.default_rng(0).normal(size=(3, 9, ITERATIONS))
@@ -35,9 +40,9 @@ def test_the_criterion_decides_the_order(
     returns: dict[Curve, np.ndarray], by: str, iteration: int | None, first: float
 ) -> None:
     ranks = rank_curves(table_of(returns), iteration, by)
-    assert ranks[0].curve.gae_lambda == first and ranks[0].behind is None and not ranks[0].is_worse
+    assert ranks[0].curve.gae_lambda == first and ranks[0].behind is None
     assert ranks[-1].curve.condition == "no_vf" or by == "last"
-    assert all(rank.is_worse for rank in ranks[1:])
+    assert all(is_behind(rank) for rank in ranks[1:])
     for rank in ranks:
         runs = returns[rank.curve][:, :iteration]
         assert rank.n_seeds == 9
@@ -48,7 +53,7 @@ def test_the_criterion_decides_the_order(
 def test_equals_are_not_told_apart() -> None:
     noise = np.random.default_rng(1).normal(size=(2, 21, ITERATIONS))
     ranks = rank_curves(table_of({Curve(0.9, 1.0): noise[0], Curve(0.9, 0.5): noise[1]}))
-    assert not ranks[1].is_worse
+    assert not is_behind(ranks[1])
 
 
 def test_iterations_without_an_episode_do_not_count_in_the_mean() -> None:
@@ -73,6 +78,13 @@ def test_as_a_table(returns: dict[Curve, np.ndarray]) -> None:
     assert len({line.count("|") for line in lines}) == 1 and len(lines) == 5
     assert lines[2].startswith("| value function by trust region | 0.9 | 0.5 | 9 | 30.0 [")
     assert lines[2].endswith("|  |") and lines[-1].startswith("| no value function | 0.9 |  | 9 | 1.")
+
+
+@pytest.mark.parametrize("few", [4, 5])
+def test_intervals_of_few_seeds_come_with_a_caution(returns: dict[Curve, np.ndarray], few: int) -> None:
+    returns[Curve(0.9, 0.5)] = returns[Curve(0.9, 0.5)][:few]
+    said = caution(rank_curves(table_of(returns)))
+    assert said == ("With fewer than 5 seeds the intervals are too narrow to tell chance." if few < 5 else "")
 
 
 def test_what_it_does_not_know(returns: dict[Curve, np.ndarray]) -> None:

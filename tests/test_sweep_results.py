@@ -1,5 +1,6 @@
 """Results of a sweep: export, statistics, selections and figures."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,13 @@ from matplotlib.figure import Figure
 from rliable import metrics
 
 from sb3_gae.sweep import Cell, Curve, SweepError, SweepStudy, draw, export, read_results, results_of, select
+from sb3_gae.sweep.cli import main
 from sb3_gae.sweep.export import SUFFIXES
 from sb3_gae.sweep.figures.curves import curves_figure
 from sb3_gae.sweep.figures.heatmap import heatmap_figure
 from sb3_gae.sweep.figures.lambda_curve import lambda_figure
 from sb3_gae.sweep.grid import cells_of, product
-from sb3_gae.sweep.ledger import Status
+from sb3_gae.sweep.ledger import Outcome, Status
 from sb3_gae.sweep.provenance import provenance
 from sb3_gae.sweep.recorder import COLUMNS
 from sb3_gae.sweep.results import COLUMNS as COLUMNS_OF_TABLE
@@ -174,6 +176,28 @@ def test_curves_have_a_band_and_a_legend(table: pd.DataFrame) -> None:
     assert all(text in shown for text in ("γ = 0.9, λ = 0.5", "no value function", "5 seeds", "iteration (batch)"))
 
 
+def test_few_runs_have_a_mean(table: pd.DataFrame) -> None:
+    chosen = select(table, gammas=[0.9])
+    for count, shown in ((4, "IQM over 4 seeds"), (3, "mean over 3 seeds"), (1, "mean over 1 seed,")):
+        some = chosen[chosen["seed"] < count]
+        assert shown in texts(curves_figure(some)) and shown in texts(lambda_figure(some))
+    assert "(mean)" in texts(heatmap_figure(chosen[chosen["seed"] < 3])) and "(IQM)" in texts(heatmap_figure(chosen))
+    mixed = chosen[(chosen["seed"] < 3) | (chosen["gae_lambda"] == 0.5)]
+    assert "IQM over 3 to 5 seeds (of fewer than 4 the mean)" in texts(curves_figure(mixed))
+
+
+def test_curves_say_where_episodes_ended_if_that_is_rare(table: pd.DataFrame) -> None:
+    chosen = select(table, gammas=[0.9], lambdas=[0.5], conditions=["trust_region"])
+    figure = curves_figure(chosen)  # in three iterations of four
+    assert figure.axes[0].lines[0].get_marker() == "None" and "dots" not in texts(figure)
+    rare = chosen.assign(mean_return=chosen["mean_return"].where(chosen["iteration"] == 3))
+    figure = curves_figure(rare)
+    (line,) = figure.axes[0].lines
+    assert line.get_marker() == "o" and "dots: episodes ended" in texts(figure)
+    marked = np.asarray(line.get_xdata())[line.get_markevery()]  # type: ignore[index]
+    assert marked.tolist() == [3]
+
+
 def test_heatmap_frames_the_best_cell(table: pd.DataFrame) -> None:
     figure = heatmap_figure(select(table, conditions=["trust_region"]))
     axes = figure.axes[0]
@@ -216,6 +240,8 @@ def test_figures_are_the_same_bit_for_bit(kind: str, table: pd.DataFrame, tmp_pa
         ("heatmap", {"iteration": 5}, "`iteration` must be from 1 to 4"),
         ("lambda", {}, "at one γ, and the selection has 0.9, 1"),
         ("lambda", {"gammas": [0.9], "lambdas": [0.5]}, "needs at least two λ"),
+        ("curves", {"output": "out.pdf"}, "`output` must end in .png or .svg, or have no ending for both, got 'out.pdf'"),
+        ("curves", {"output": "out.SVG"}, "`output` must end in .png or .svg"),
         ("pie", {}, "`figure` knows curves, heatmap, lambda"),
     ],
 )
@@ -223,7 +249,7 @@ def test_empty_and_mixed_selections(
     kind: str, arguments: dict[str, Any], message: str, table: pd.DataFrame, tmp_path: Path
 ) -> None:
     with pytest.raises(SweepError) as error:
-        draw(kind, table, tmp_path / "figure", **arguments)
+        draw(kind, table, tmp_path / arguments.pop("output", "figure"), **arguments)
     assert message in str(error.value) and "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
 
@@ -239,6 +265,191 @@ def test_runs_of_different_lengths_are_not_mixed(table: pd.DataFrame, tmp_path: 
 
 def test_rows_of_some_cells(table: pd.DataFrame) -> None:
     assert sorted(rows_of_cells(table, CELLS[:2])["trial"].unique()) == [0, 1]
+
+
+# --- What is not finished ---
+
+
+@pytest.fixture
+def unfinished(tmp_path: Path) -> SweepStudy:
+    """Cells that are done, failed, stopped and begun anew, lost, running and waiting."""
+    study = SweepStudy("s", str(tmp_path / "s.journal"))
+    cells = CELLS[:6]
+    fill(study, cells[:1])
+    study.enqueue(cells)
+    for cell, outcome in zip(cells[1:4], (Outcome.FAILED, Outcome.STOPPED, Outcome.LOST), strict=True):
+        claim = study.claim([cell])
+        assert claim is not None
+        claim.append([dict.fromkeys(COLUMNS, 1.0) | {"iteration": number} for number in (1.0, 2.0)])
+        claim.give_up(outcome, "")
+    study.enqueue(cells[2:3])
+    claim = study.claim(cells[4:5])
+    assert claim is not None
+    claim.append([dict.fromkeys(COLUMNS, 1.0)])
+    return study
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_what_is_not_finished_is_exported_if_asked_for(
+    suffix: str, unfinished: SweepStudy, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+    path = tmp_path / f"partial{suffix}"
+    export_command = ["export", "--name", "s", "--storage", unfinished.location, "-o", str(path)]
+    assert main([*export_command, "--partial"]) == 0
+    assert "11 rows, 5 runs" in capsys.readouterr().out
+    table = read_results(path, partial=True)
+    pd.testing.assert_frame_equal(table, results_of(unfinished, partial=True))
+    counts = {"done": 4, "failed": 2, "stopped": 2, "lost": 2, "running": 1}
+    assert table["state"].value_counts().to_dict() == counts
+    # All else takes the finished cell alone
+    finished = results_of(unfinished)
+    assert "state" not in finished and len(finished) == 4
+    pd.testing.assert_frame_equal(read_results(path), finished)
+    pd.testing.assert_frame_equal(select(table), finished)
+    assert take_in(SweepStudy("other", str(tmp_path / "other.journal")), table) == 1
+    # Nor is it lost
+    said = refusal(*export_command, capsys=capsys)
+    assert "has runs that are not finished, too; pass --partial, or name another file" in said
+    assert main([*export_command, "--partial"]) == 0
+
+
+# --- What does not go together ---
+
+
+def write_runs(table: pd.DataFrame, path: Path) -> Path:
+    """As an export, unless something is wrong with the table."""
+    table.to_csv(path, index=False)
+    return path
+
+
+@pytest.fixture
+def runs(table: pd.DataFrame) -> pd.DataFrame:
+    """Three seeds of one curve."""
+    return table[(table["gamma"] == 1.0) & (table["gae_lambda"] == 0.5) & (table["seed"] < 3)].reset_index(drop=True)
+
+
+def refusal(*arguments: str, capsys: pytest.CaptureFixture[str]) -> str:
+    assert main(arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith("sb3_gae.sweep: ") and said.err.count("\n") == 1
+    return said.err
+
+
+@pytest.mark.parametrize("rows", [[0, 1, 2], [0, 1, 3], [1, 2, 3], [0, 1, 2, 2], [0, 1, 2, 3, 3]])
+@pytest.mark.parametrize("command", ["rank --from {}", "figure curves --from {}", "import {} --name other"])
+def test_runs_that_are_not_whole_are_refused(
+    command: str,
+    rows: list[int],
+    runs: pd.DataFrame,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    places = [*range(4), *(4 + row for row in rows), *range(8, 12)]
+    path = write_runs(runs.iloc[places], tmp_path / "cut.csv")
+    said = refusal(*command.format(path).split(), capsys=capsys)
+    assert "cut.csv does not have each iteration from 1 to 4 once of CartPole-v1, trust_region" in said
+    assert "γ = 1, λ = 0.5, seed 1," in said
+    assert not (tmp_path / "logs").exists()
+
+
+def test_what_is_not_there_is_no_iteration_without_an_episode(runs: pd.DataFrame, tmp_path: Path) -> None:
+    for wrong in (runs[:-1], pd.concat([runs, runs[:1]]), runs[runs["iteration"] != 2]):
+        with pytest.raises(SweepError, match=r"Runs of trust_region, γ = 1, λ = 0.5 are not whole, or there twice"):
+            series_of(wrong)
+        with pytest.raises(SweepError, match="The table does not have each iteration"):
+            take_in(SweepStudy("s", str(tmp_path / "s.journal")), wrong)
+    assert series_of(runs[runs["iteration"] < 3])[0].returns.shape == (3, 2), "shorter runs are whole, too"
+
+
+def test_unknown_conditions_are_refused(runs: pd.DataFrame, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = str(write_runs(runs.assign(condition="trust_regoin"), tmp_path / "other.csv"))
+    for command in (["rank"], ["figure", "curves"]):
+        said = refusal(*command, "--from", path, capsys=capsys)
+        assert "other.csv has the condition 'trust_regoin'" in said and said.endswith("; did you mean 'trust_region'?\n")
+    with pytest.raises(SweepError, match="`conditions` knows"):
+        series_of(runs.assign(condition="trust_regoin"))
+
+
+def test_a_run_that_is_in_several_files_counts_once(
+    runs: pd.DataFrame, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [str(export(runs, tmp_path / f"s{suffix}")) for suffix in (".csv", ".csv.gz")]
+    # The first seed was run again elsewhere, with the same results, beside others of its own
+    again = runs[runs["seed"] == 0].assign(seconds=7.0, sweep="there", trial=0)
+    own = runs[runs["seed"] > 0].assign(sweep="there", trial=runs["trial"] - 1)
+    own["seed"] += 10
+    files.append(str(export(pd.concat([again, own]), tmp_path / "there.csv")))
+    assert main(["rank", "--from", files[0]]) == 0
+    alone = capsys.readouterr().out
+    assert main(["rank", "--from", files[0], files[0], files[1]]) == 0
+    assert capsys.readouterr().out == alone
+    assert main(["rank", "--from", *files]) == 0
+    assert "| 1 | 0.5 | 5 |" in capsys.readouterr().out
+
+
+def test_runs_of_two_machines_may_have_the_same_numbers(
+    runs: pd.DataFrame, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [str(export(runs, tmp_path / "here.csv"))]
+    files.append(str(export(runs.assign(seed=runs["seed"] + 10), tmp_path / "there.csv")))
+    assert main(["import", *files, "--name", "both", "--storage", str(tmp_path / "both.journal")]) == 0
+    assert "6 of 6 cells added" in capsys.readouterr().out
+    assert len(results_of(SweepStudy("both", str(tmp_path / "both.journal")))) == 24
+
+
+def test_runs_with_other_results_are_refused(runs: pd.DataFrame, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [str(export(runs, tmp_path / "a.csv"))]
+    other = runs.copy()
+    other.loc[(other["seed"] == 1) & (other["iteration"] == 3), "mean_return"] += 1.0
+    files.append(str(export(other, tmp_path / "b.csv")))
+    said = refusal("rank", "--from", *files, capsys=capsys)
+    assert "seed 1 of CartPole-v1, trust_region, γ = 1, λ = 0.5, 4 iterations is in both" in said
+    assert "a.csv" in said and "b.csv with different results" in said
+
+
+def with_setting(table: pd.DataFrame, **settings: Any) -> pd.DataFrame:
+    return table.assign(settings=json.dumps({"gae_lambda": 0.5, "policy": "MlpPolicy", "target_kl": 0.0035, **settings}))
+
+
+def test_other_settings_are_not_one_curve(runs: pd.DataFrame, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [str(export(with_setting(runs), tmp_path / "a.csv"))]
+    more = runs.assign(seed=runs["seed"] + 3)
+    files.append(str(export(with_setting(more, target_kl=0.5), tmp_path / "b.csv")))
+    for command in (["rank"], ["figure", "curves", "-o", str(tmp_path / "curves")]):
+        said = refusal(*command, "--from", *files, capsys=capsys)
+        assert "Runs of CartPole-v1, trust_region have different settings (target_kl 0.0035 -> 0.5)" in said
+    said = refusal("import", *files, "--name", "s", "--storage", str(tmp_path / "s.journal"), capsys=capsys)
+    assert "(target_kl 0.0035 -> 0.5); import them into a sweep of another --name" in said
+    # λ is of the grid, other versions and commits are no other settings, and unknown ones say nothing
+    other = with_setting(more, gae_lambda=0.9).assign(commit="9", torch="9")
+    unknown = runs.assign(seed=runs["seed"] + 6, settings="")
+    files[1:] = [str(export(table, tmp_path / f"{number}.csv")) for number, table in enumerate((other, unknown))]
+    assert main(["rank", "--from", *files]) == 0
+
+
+def test_other_settings_are_not_taken_in(runs: pd.DataFrame, tmp_path: Path) -> None:
+    study = SweepStudy("s", str(tmp_path / "s.journal"))
+    others = with_setting(runs.assign(seed=runs["seed"] + 3), target_kl=0.5)
+    assert take_in(study, with_setting(runs)) == 3
+    with pytest.raises(SweepError, match=r"have different settings \(target_kl 0.0035 -> 0.5\)"):
+        take_in(study, others)
+    # Nor does what is run now differ from what was taken in; vf_steps is of the cells
+    now = {"gae_lambda": 0.97, "policy": "MlpPolicy", "target_kl": 0.5, "vf_steps": 9}
+    study = SweepStudy("t", str(tmp_path / "t.journal"))
+    take_in(study, with_setting(runs, vf_steps=2))
+    with pytest.raises(SweepError, match=r"other settings than the sweep \(target_kl 0.5 -> 0.0035\)"):
+        study.check_settings({"CartPole-v1": now})
+    study.check_settings({"CartPole-v1": now | {"target_kl": 0.0035}})
+    # And what has begun takes in no others, though nothing is done yet
+    study = SweepStudy("u", str(tmp_path / "u.journal"))
+    study.check_settings({"CartPole-v1": now | {"target_kl": 0.0035}})
+    with pytest.raises(SweepError, match=r"other settings than the sweep \(target_kl 0.0035 -> 0.5\)"):
+        take_in(study, with_setting(runs, target_kl=0.5, vf_steps=2))
+    assert study.trials() == []
 
 
 # --- Back into a sweep ---

@@ -42,7 +42,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def start(seeds: int, *arguments: str) -> "subprocess.Popen[str]":
+def start(seeds: int, *arguments: str, own_group: bool = False) -> "subprocess.Popen[str]":
     paths = [str(HERE), str(HERE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     return subprocess.Popen(
         [sys.executable, *COMMAND.split(), str(seeds), *arguments],
@@ -50,6 +50,7 @@ def start(seeds: int, *arguments: str) -> "subprocess.Popen[str]":
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
+        start_new_session=own_group,
     )
 
 
@@ -192,6 +193,36 @@ def test_a_worker_that_is_killed_is_replaced() -> None:
     assert [standing.status for standing in SweepStudy("s").standings().values()] == [Status.DONE] * 3
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_ctrl_c_while_processes_start_prints_no_tracebacks() -> None:
+    process = start(4, "--jobs", "2", own_group=True)
+    until = time.monotonic() + 60.0
+    while sum(map(is_worker_that_can_be_interrupted, children_of(process.pid))) < 2:
+        assert process.poll() is None and time.monotonic() < until
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    output = finish(process, 130)
+    assert "Traceback" not in output and "KeyboardInterrupt" not in output
+    assert runs() == []
+
+
+def children_of(pid: int) -> list[int]:
+    threads = Path(f"/proc/{pid}/task").glob("*/children")
+    return [int(child) for thread in threads for child in thread.read_text().split()]
+
+
+def is_worker_that_can_be_interrupted(pid: int) -> bool:
+    """Python has begun, and imports."""
+    try:
+        command, status = (Path(f"/proc/{pid}/{name}").read_text() for name in ("cmdline", "status"))
+    except OSError:
+        return False
+    if "spawn_main" not in command:
+        return False
+    caught = int(status.partition("SigCgt:")[2].split()[0], base=16)
+    return bool(caught & 1 << (signal.SIGINT - 1))
+
+
 def test_two_commands_share_a_grid() -> None:
     processes = [start(8), start(8)]
     outputs = [finish(process) for process in processes]
@@ -207,8 +238,10 @@ def test_two_commands_share_a_grid() -> None:
     [
         ({"env": "SweepTsk-v0"}, "did you mean 'SweepTask-v0'?"),
         ({"gym_packages": ["no_such_module"]}, "no_such_module cannot be imported"),
-        ({"jobs": 0}, "`jobs` must be at least 1"),
         ({"silent_after": 0.0}, "`silent_after` must be a number of seconds above 0"),
+        ({"jobs": 0}, "`jobs` must be a whole number of at least 1, got 0"),
+        ({"threads": 0}, "`threads` must be a whole number of at least 1, got 0"),
+        ({"device": "foo"}, "`device`: PyTorch cannot use 'foo' here"),
         ({"conf_file": "nowhere.yml"}, "no settings of SweepTask-v0 in nowhere.yml"),
         ({"hyperparams": {"n_step": 8}}, "did you mean 'n_steps'?"),
     ],

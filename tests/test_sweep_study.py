@@ -1,7 +1,9 @@
 """A sweep in its storage: who may run a cell, and what becomes of those whose process is gone."""
 
+import contextlib
 import os
 import socket
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -17,6 +19,7 @@ from sb3_gae.sweep.errors import UnreachableError
 from sb3_gae.sweep.ledger import MAX_LOST, Outcome, Status
 from sb3_gae.sweep.liveness import sign_of_life, why_dead
 from sb3_gae.sweep.patience import Patience
+from sb3_gae.sweep.storage import holds
 from sb3_gae.sweep.study import TakenOverError
 
 CELLS = [Cell("CartPole-v1", "trust_region", 0.9, value, 0, 3) for value in (0.0, 0.5, 1.0)]
@@ -182,7 +185,8 @@ def test_signs_of_life() -> None:
 
 
 @pytest.mark.parametrize("torn", ['{"op_code":8,"worker_id":"x', "x" * 3_000_000], ids=["short", "long"])
-def test_a_journal_survives_a_write_that_was_cut_off(journal: str, torn: str) -> None:
+def test_a_journal_survives_a_write_that_was_cut_off(journal: str, torn: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_gae.sweep.storage._SETTLE_SECONDS", 0.05)
     study = SweepStudy("s", journal)
     study.enqueue(CELLS)
     with Path(journal).open("a") as file:
@@ -192,6 +196,57 @@ def test_a_journal_survives_a_write_that_was_cut_off(journal: str, torn: str) ->
     claim.complete(1.0)
     assert statuses(study) == [Status.DONE, Status.WAITING, Status.WAITING]
     assert torn not in Path(journal).read_text()
+
+
+def test_a_line_that_somebody_still_writes_is_not_cut(journal: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_gae.sweep.storage._SETTLE_SECONDS", 0.4)
+    study = SweepStudy("s", journal)
+    line = Path(journal).read_bytes().splitlines(keepends=True)[-1].replace(b'"sb3_gae_sweep_format"', b'"slow"')
+    assert b'{"slow":1}' in line
+
+    def write_slowly() -> None:
+        for part in (line[20:40], line[40:]):
+            time.sleep(0.1)
+            with Path(journal).open("ab") as file:
+                file.write(part)
+
+    with Path(journal).open("ab") as file:
+        file.write(line[:20])
+    writer = threading.Thread(target=write_slowly)
+    writer.start()
+    study.enqueue(CELLS)
+    writer.join()
+    assert optuna.load_study(study_name="s", storage=storage_of(journal)).user_attrs["slow"] == 1
+    assert len(SweepStudy("s", journal).trials()) == 3
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        '{"results": [1, 2]}',
+        '{"op_code": 1}\n',
+        '{"op_code":0,"worker_id":"x","study',
+        "Dear Sir",
+        "Dear Sir\n",
+        "\n",
+        "[]\n",
+        "\0\x01" * 5000,
+    ],
+)
+@pytest.mark.parametrize("create", [True, False])
+def test_a_file_that_is_no_journal_stays_as_it_is(content: str, create: bool, journal: str) -> None:
+    Path(journal).write_text(content)
+    with pytest.raises(SweepError, match=r"sweep\.journal") as error:
+        SweepStudy("s", journal, create=create)
+    assert "\n" not in str(error.value)
+    assert Path(journal).read_text() == content
+    assert [path.name for path in Path(journal).parent.iterdir()] == ["sweep.journal"]
+
+
+def test_an_empty_file_becomes_a_journal(journal: str) -> None:
+    Path(journal).touch()
+    SweepStudy("s", journal).enqueue(CELLS)
+    assert len(SweepStudy("s", journal, create=False).trials()) == 3
 
 
 def test_a_lock_that_was_left_behind_does_not_stop_the_sweep_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -244,7 +299,7 @@ def test_other_formats_and_other_studies_are_refused(journal: str) -> None:
         ("postgresql+psycopg://me:top@secret@host/x", "inside a user or a password it is written %40"),
         ("postgresql+psycopg://me:top:secret@host:a/x", "the port is a number"),
         ("postgresql+asyncpg://me:secret@host/x", 'pip install "sb3-gae[postgresql]"'),
-        ("mysql+pymysql://me:secret@localhost/x", "needs a driver that is not installed"),
+        ("mysql+pymysql://me:secret@localhost/x", "needs a driver that is not installed (pip install pymysql)"),
     ],
 )
 def test_storages_that_cannot_be_used(location: str, message: str, tmp_path: Path) -> None:
@@ -257,8 +312,6 @@ def test_storages_that_cannot_be_used(location: str, message: str, tmp_path: Pat
 
 
 def test_a_locked_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import sqlite3
-
     location = f"sqlite:///{tmp_path}/sweep.db"
     SweepStudy("s", location)
     monkeypatch.setattr("sb3_gae.sweep.storage._LOCK_SECONDS", 0.1)
@@ -267,6 +320,24 @@ def test_a_locked_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(SweepError, match=r"is locked by another program; wait for it, or pass another --storage"):
         SweepStudy("s", location)
     holder.close()
+
+
+def test_looking_makes_no_database(tmp_path: Path) -> None:
+    location = f"sqlite:///{tmp_path}/sweep.db"
+    assert not holds(location, "s")
+    with pytest.raises(SweepError, match="There is no sweep at sqlite:"):
+        SweepStudy("s", location, create=False)
+    assert not list(tmp_path.iterdir())
+    # Nor tables in somebody else's
+    with contextlib.closing(sqlite3.connect(tmp_path / "sweep.db")) as database:
+        database.execute("CREATE TABLE letters (text TEXT)")
+    before = (tmp_path / "sweep.db").read_bytes()
+    assert not holds(location, "s")
+    with pytest.raises(SweepError, match="There is no sweep at sqlite:"):
+        SweepStudy("s", location, create=False)
+    assert (tmp_path / "sweep.db").read_bytes() == before
+    SweepStudy("s", location)
+    assert holds(location, "s") and not holds(location, "t")
 
 
 def test_what_is_not_there_is_not_made(tmp_path: Path) -> None:

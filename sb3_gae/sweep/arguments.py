@@ -6,6 +6,7 @@ from typing import Any
 from rl_zoo3.utils import StoreDict
 
 from sb3_gae.sweep.conditions import CONDITIONS
+from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.figures import KINDS
 from sb3_gae.sweep.liveness import SILENT_AFTER
 from sb3_gae.sweep.presets import PRESETS
@@ -21,6 +22,27 @@ presets:
 """
 
 
+class _StoreParams(StoreDict):
+    """rl-zoo3's, with errors of one line."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        params: dict[str, Any] = {}
+        for value in values:
+            name, colon, text = value.partition(":")
+            if not name or not colon or not text:
+                raise SweepError(f"`-params` are written as name:value, got {value!r}.")
+            try:
+                super().__call__(parser, namespace, [value], option_string)
+            except Exception as error:
+                what = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+                raise SweepError(
+                    f"`-params {name}` must be a value in Python, got {text} ({what}); a text needs quotes of its own, "
+                    f"as in -params \"{name}:'{text}'\"."
+                ) from None
+            params |= getattr(namespace, self.dest)
+        setattr(namespace, self.dest, params)
+
+
 def make_parser() -> argparse.ArgumentParser:
     """:return: of the whole command line"""
     presets = "\n".join(f"  {name:<11} {preset.title}" for name, preset in PRESETS.items())
@@ -34,9 +56,16 @@ def make_parser() -> argparse.ArgumentParser:
     _add_run(commands.add_parser("run", help="run the cells of a grid that are not done yet"))
     status = commands.add_parser("status", help="what is done, running, left, and failed for what reason")
     _add_study(status)
+    status.add_argument("--tracebacks", action="store_true", help="where cells that failed did so, in full")
     exported = commands.add_parser("export", help="results as CSV and Parquet, a row for each seed and iteration")
     _add_study(exported)
     exported.add_argument("-o", "--output", nargs="+", help="files (default: logs/sweeps/NAME.csv and .parquet)")
+    exported.add_argument(
+        "--partial",
+        action="store_true",
+        help="also what is stored of cells that run, failed, were stopped or lost, with a column `state`; "
+        "figures, rank and import take only the finished cells of such a file",
+    )
     taken_in = commands.add_parser("import", help="add the finished cells of exported files to a sweep")
     taken_in.add_argument("files", nargs="+", metavar="FILE", help="CSV or Parquet")
     _add_study(taken_in)
@@ -63,7 +92,11 @@ def _add_run(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--first-seed", type=int, default=0, help="the lowest of them (default: 0)")
     parser.add_argument("--iterations", type=int, help="batches of each run")
     parser.add_argument(
-        "-params", "--hyperparams", nargs="+", action=StoreDict, help="other hyperparameters, e.g. target_kl:0.02 vf_steps:3"
+        "-params",
+        "--hyperparams",
+        nargs="+",
+        action=_StoreParams,
+        help="other hyperparameters, e.g. target_kl:0.02 vf_steps:3",
     )
     parser.add_argument("-conf", "--conf-file", help="settings file as rl-zoo3's (default: the shipped one)")
     parser.add_argument("--gym-packages", nargs="+", default=[], help="modules that register environments")

@@ -14,13 +14,16 @@ from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.export import export
 from sb3_gae.sweep.figures import draw
 from sb3_gae.sweep.ledger import Status
-from sb3_gae.sweep.plan import Options, Plan, default_name, make_cells
+from sb3_gae.sweep.machine import check_jobs
+from sb3_gae.sweep.plan import Options, Plan, check_seeds, default_name, make_cells
+from sb3_gae.sweep.presets import find_preset
 from sb3_gae.sweep.report import failures, overview, running
 from sb3_gae.sweep.results import NO_PARQUET, read_results, results_of, select
 from sb3_gae.sweep.runner import check_plan, run_plan, standings_of
+from sb3_gae.sweep.runs import combine, runs_of
 from sb3_gae.sweep.storage import holds
 from sb3_gae.sweep.study import SweepStudy, default_location
-from sb3_gae.sweep.take_in import runs_of, take_in
+from sb3_gae.sweep.take_in import take_in
 
 #: for the shell
 _FAILED_CELLS, _BAD_INPUT, _STOPPED = 1, 2, 130
@@ -31,8 +34,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     :param arguments: of the command line; None for those of this process
     :return: exit status: 0, or 1 if cells failed, 2 after bad input, 130 if it was stopped
     """
-    args = make_parser().parse_args(arguments)
     try:
+        args = make_parser().parse_args(arguments)
         return _COMMANDS[args.command](args)
     except SweepError as error:
         print(f"sb3_gae.sweep: {error}", file=sys.stderr)
@@ -42,6 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
+    check_jobs(args.jobs)
     plan = _plan_of(args)
     if args.dry_run:
         return _dry_run(plan, args.jobs)
@@ -57,7 +61,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _plan_of(args: argparse.Namespace) -> Plan:
-    seeds = None if args.seeds is None else range(args.first_seed, args.first_seed + args.seeds)
+    seeds = None if args.seeds is None else range(args.first_seed, args.first_seed + check_seeds(args.seeds))
     if seeds is None and args.first_seed:
         raise SweepError("`first-seed` needs --seeds, the number of them.")
     cells = make_cells(
@@ -105,21 +109,22 @@ def _status(args: argparse.Namespace) -> int:
     table = study.standings()
     print(overview(study.name, table))
     print(running(table), end="")
-    print(failures(table), end="")
+    print(failures(table, tracebacks=args.tracebacks), end="")
     return 0
 
 
 def _export(args: argparse.Namespace) -> int:
     study = _study_of(args)
-    table = results_of(study)
+    table = results_of(study, partial=args.partial)
     outputs = args.output
     if outputs is None:
         outputs = [f"logs/sweeps/{study.name}.csv", f"logs/sweeps/{study.name}.parquet"]
         if importlib.util.find_spec("pyarrow") is None:
             print(f"no Parquet file: {NO_PARQUET}", file=sys.stderr)
             outputs.pop()
+    of_runs = "runs" if args.partial else "cells"
     for output in outputs:
-        print(f"wrote {export(table, output)}: {len(table)} rows, {table['trial'].nunique()} cells")
+        print(f"wrote {export(table, output)}: {len(table)} rows, {table['trial'].nunique()} {of_runs}")
     return 0
 
 
@@ -143,9 +148,13 @@ def _rank(args: argparse.Namespace) -> int:
     table, _ = _results_of(args)
     chosen = select(table, **selection_of(args))
     # Every process of a sweep would wait for rliable
-    from sb3_gae.sweep.ranking import as_markdown, rank_curves
+    from sb3_gae.sweep.ranking import as_markdown, caution, rank_curves
 
-    print(as_markdown(rank_curves(chosen, args.iteration, args.by)))
+    ranks = rank_curves(chosen, args.iteration, args.by)
+    print(as_markdown(ranks))
+    # Not into the table, which may go into a document
+    if warning := caution(ranks):
+        print(warning, file=sys.stderr)
     return 0
 
 
@@ -160,7 +169,7 @@ def _results_of(args: argparse.Namespace) -> tuple[pd.DataFrame, str]:
 
 
 def _read(files: Sequence[str]) -> pd.DataFrame:
-    return pd.concat([read_results(file) for file in files], ignore_index=True)
+    return combine((file, read_results(file)) for file in files)
 
 
 def _study_of(args: argparse.Namespace) -> SweepStudy:
@@ -168,6 +177,8 @@ def _study_of(args: argparse.Namespace) -> SweepStudy:
 
 
 def _name_of(args: argparse.Namespace) -> str:
+    if args.preset is not None:
+        find_preset(args.preset)
     if name := args.name or args.preset:
         return str(name)
     raise SweepError("Which sweep? Give its --name, or the --preset it was made of.")

@@ -46,7 +46,7 @@ def find_condition(name: str) -> Condition:
     :raises SweepError: if there is none of that name
     """
     if name not in CONDITIONS:
-        raise SweepError(f"`conditions` knows {', '.join(CONDITIONS)}, got {name!r}{did_you_mean(name, CONDITIONS)}.")
+        raise SweepError(f"`conditions` knows {', '.join(CONDITIONS)}, got {name!r}{did_you_mean(name, CONDITIONS)}")
     return CONDITIONS[name]
 
 
@@ -54,7 +54,7 @@ def did_you_mean(name: str, known: Any) -> str:
     """
     :param name: what was typed
     :param known: names that would have been right
-    :return: the end of a sentence, empty if nothing is near
+    :return: the end of a sentence
     """
     near = difflib.get_close_matches(str(name), list(known), n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    return f"; did you mean {near[0]!r}?" if near else "."

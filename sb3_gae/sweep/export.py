@@ -8,6 +8,7 @@ import pandas as pd
 
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.results import NO_PARQUET, identities, is_parquet, read_results
+from sb3_gae.sweep.runs import STATE_COLUMN
 
 SUFFIXES = (".csv", ".csv.gz", ".parquet")
 
@@ -38,11 +39,13 @@ def export(table: pd.DataFrame, path: str | Path) -> Path:
 
 def _check_replaceable(table: pd.DataFrame, path: Path) -> None:
     try:
-        before = read_results(path)
+        before = read_results(path, partial=True)
     except SweepError as error:
         raise SweepError(f"`output`: {path} exists and is not replaced ({error}); name another file or remove it.") from None
     if other := set(before["sweep"]) - set(table["sweep"]):
         raise SweepError(f"`output`: {path} holds the sweep {', '.join(sorted(other))!r}; name another file or remove it.")
+    if STATE_COLUMN in before and STATE_COLUMN not in table:
+        raise SweepError(f"`output`: {path} has runs that are not finished, too; pass --partial, or name another file.")
     if lost := len(identities(before) - identities(table)):
         raise SweepError(f"`output`: {path} holds {lost} rows that are not in the storage; name another file or remove it.")
 

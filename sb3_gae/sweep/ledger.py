@@ -46,6 +46,11 @@ class Standing(NamedTuple):
         """Why it failed or was taken up again, empty if it was not."""
         return "" if self.trial is None else str(self.trial.user_attrs.get("reason", ""))
 
+    @property
+    def traceback(self) -> str:
+        """Where it failed, empty if it did not."""
+        return "" if self.trial is None else str(self.trial.user_attrs.get("traceback", ""))
+
 
 def key_of(cell: Mapping[str, Any]) -> str:
     """

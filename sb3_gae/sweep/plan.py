@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from sb3_gae.sweep.conditions import find_condition
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Cell, Curve, cells_of, product
 from sb3_gae.sweep.liveness import SILENT_AFTER
@@ -77,15 +78,31 @@ def make_cells(
             if value is not None:
                 raise SweepError(f"`{name}` belongs to the preset {preset!r}; leave out one of them.")
         tasks, curves = tasks or [chosen.task], list(chosen.curves)
-        seeds, iterations = chosen.seeds if seeds is None else seeds, iterations or chosen.iterations
+        seeds = chosen.seeds if seeds is None else seeds
+        iterations = chosen.iterations if iterations is None else iterations
         hyperparams = {**chosen.overrides, **(hyperparams or {})}
     else:
         for name, needed in {"env": tasks, "gammas": gammas, "seeds": seeds, "iterations": iterations}.items():
             if needed is None:
                 raise SweepError(f"`{name}` is missing; give it, or a preset.")
-        curves = product(["trust_region"] if conditions is None else conditions, gammas or (), lambdas or ())
-    which = range(seeds) if isinstance(seeds, int) else list(seeds or ())
+        conditions, lambdas = ["trust_region"] if conditions is None else list(conditions), list(lambdas or ())
+        needing = [name for name in conditions if find_condition(name).uses_lambda]
+        if needing and not lambdas:
+            raise SweepError(f"`lambdas` is missing, of which the condition {needing[0]!r} needs at least one.")
+        curves = product(conditions, gammas or (), lambdas)
+    which = range(check_seeds(seeds)) if isinstance(seeds, int) else list(seeds or ())
     return cells_of(tasks or [], curves, which, iterations or 0, hyperparams)
+
+
+def check_seeds(count: int) -> int:
+    """
+    :param count: number of seeds
+    :return: the same
+    :raises SweepError: if there is not at least one
+    """
+    if count < 1:
+        raise SweepError(f"`seeds` must be at least 1, got {count}.")
+    return count
 
 
 def default_name(preset: str | None, tasks: Iterable[str]) -> str:

@@ -18,7 +18,6 @@ class Preset:
     :param curves: what is compared
     :param seeds: number of runs of each curve
     :param iterations: batches of each run
-    :param figures: that are worth making of it: ``curves``, ``heatmap``, ``lambda``
     :param overrides: hyperparameters that differ from the shipped settings
     """
 
@@ -27,7 +26,6 @@ class Preset:
     curves: tuple[Curve, ...]
     seeds: int
     iterations: int
-    figures: tuple[str, ...]
     overrides: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -44,7 +42,6 @@ PRESETS: dict[str, Preset] = {
         (Curve(0.99, None, "no_vf"), *product(["trust_region"], [0.99], sorted(PAPER_LAMBDAS, reverse=True))),
         seeds=21,
         iterations=50,
-        figures=("curves", "lambda"),
     ),
     "fig2-right": Preset(
         "Figure 2 right: cart-pole over γ and λ",
@@ -52,7 +49,6 @@ PRESETS: dict[str, Preset] = {
         tuple(product(["trust_region"], _GAMMAS, PAPER_LAMBDAS)),
         seeds=21,
         iterations=20,
-        figures=("heatmap",),
     ),
     "fig3-left": Preset(
         "Figure 3 left: biped, nine pairs of γ and λ and no value function",
@@ -65,7 +61,6 @@ PRESETS: dict[str, Preset] = {
         ),
         seeds=9,
         iterations=500,
-        figures=("curves",),
     ),
     "fig3-right": Preset(
         "Figure 3 right: quadruped at γ = 0.995",
@@ -73,7 +68,6 @@ PRESETS: dict[str, Preset] = {
         (Curve(0.995, None, "no_vf"), Curve(0.995, 1.0), Curve(0.995, 0.96)),
         seeds=5,
         iterations=1000,
-        figures=("curves",),
         overrides=_PAPER_BATCH,
     ),
     "fig4b": Preset(
@@ -82,7 +76,6 @@ PRESETS: dict[str, Preset] = {
         (Curve(0.99, None, "no_vf"), Curve(0.99, 1.0), Curve(0.99, 0.96)),
         seeds=5,
         iterations=500,
-        figures=("curves",),
         overrides=_PAPER_BATCH,
     ),
     "small": Preset(
@@ -91,7 +84,6 @@ PRESETS: dict[str, Preset] = {
         tuple(product(["trust_region"], [0.96, 0.99], [0.0, 0.84, 0.96, 1.0])),
         seeds=4,
         iterations=20,
-        figures=("curves", "heatmap", "lambda"),
     ),
 }
 
@@ -103,5 +95,5 @@ def find_preset(name: str) -> Preset:
     :raises SweepError: if there is none of that name
     """
     if name not in PRESETS:
-        raise SweepError(f"`preset` knows {', '.join(PRESETS)}, got {name!r}{did_you_mean(name, PRESETS)}.")
+        raise SweepError(f"`preset` knows {', '.join(PRESETS)}, got {name!r}{did_you_mean(name, PRESETS)}")
     return PRESETS[name]

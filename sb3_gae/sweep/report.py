@@ -29,14 +29,19 @@ def overview(name: str, table: dict[str, Standing]) -> str:
     return "\n".join(lines)
 
 
-def failures(table: dict[str, Standing]) -> str:
+def failures(table: dict[str, Standing], *, tracebacks: bool = False) -> str:
     """
     :param table: where each cell stands, by its key
+    :param tracebacks: whether each line is followed by the traceback
     :return: a line for each cell that failed, with its reason; at most the first 20
     """
-    failed = [f"failed: {_named(key)}: {one.reason}\n" for key, one in table.items() if one.status == Status.FAILED]
+    failed = [
+        f"failed: {_named(key)}: {one.reason}\n{one.traceback if tracebacks else ''}"
+        for key, one in table.items()
+        if one.status == Status.FAILED
+    ]
     more = f"... and {len(failed) - _LISTED} more\n" if len(failed) > _LISTED else ""
-    advice = "Run them again with --retry-failed.\n" if failed else ""
+    advice = "Run them again with --retry-failed; see their tracebacks with status --tracebacks.\n" if failed else ""
     return "".join(failed[:_LISTED]) + more + advice
 
 

@@ -1,37 +1,51 @@
 """Results as a table: a row for each iteration of each finished cell, from a study or from an exported file."""
 
 import json
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from optuna.trial import FrozenTrial
+from optuna.trial import FrozenTrial, TrialState
 
+from sb3_gae.sweep.agreement import check_alike, made_in
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Cell
-from sb3_gae.sweep.ledger import Status
+from sb3_gae.sweep.ledger import Outcome, Status, standings
 from sb3_gae.sweep.provenance import PROVENANCE_COLUMNS
 from sb3_gae.sweep.recorder import COLUMNS as ROW_COLUMNS
+from sb3_gae.sweep.runs import CELL_COLUMNS, STATE_COLUMN, cell_of, check_runs, finished
 from sb3_gae.sweep.study import FORMAT, SweepStudy
 
-#: what identifies a run
-CELL_COLUMNS = ("task", "condition", "gamma", "gae_lambda", "seed", "iterations", "overrides")
 _TEXT_COLUMNS = ("sweep", "task", "condition", "overrides", *PROVENANCE_COLUMNS, "settings")
 _COUNT_COLUMNS = ("format", "seed", "iterations", "iteration", "timesteps", "episodes", "trial")
 #: of the table and of exported files
 COLUMNS = ("format", "sweep", *CELL_COLUMNS, *ROW_COLUMNS, "setup_seconds", "trial", *PROVENANCE_COLUMNS, "settings")
 
 
-def results_of(study: SweepStudy) -> pd.DataFrame:
+def results_of(study: SweepStudy, *, partial: bool = False) -> pd.DataFrame:
     """
     :param study: of a sweep
+    :param partial: whether to include what is stored of other runs; a column ``state`` then tells ``done``, ``running``,
+        ``failed``, ``stopped`` and ``lost`` apart
     :return: finished cells, with the columns of :data:`~sb3_gae.sweep.results.COLUMNS`, in the order of their trials
     """
-    done = [standing.trial for standing in study.standings().values() if standing.status == Status.DONE]
-    rows = [row for trial in sorted(filter(None, done), key=lambda trial: trial.number) for row in _rows_of(trial, study.name)]
-    return _typed(pd.DataFrame(rows, columns=list(COLUMNS)))
+    trials = study.trials()
+    done = {
+        standing.trial.number for standing in standings(trials).values() if standing.status == Status.DONE and standing.trial
+    }
+    states = {trial.number: Status.DONE if trial.number in done else _state_of(trial) for trial in trials}
+    rows = [
+        row | {STATE_COLUMN: str(states[trial.number])}
+        for trial in sorted(trials, key=lambda trial: trial.number)
+        if trial.number in done or (partial and "cell" in trial.user_attrs)
+        for row in _rows_of(trial, study.name)
+    ]
+    return _typed(pd.DataFrame(rows, columns=[*COLUMNS, *([STATE_COLUMN] if partial else [])]))
+
+
+def _state_of(trial: FrozenTrial) -> str:
+    return "running" if trial.state == TrialState.RUNNING else str(trial.user_attrs.get("outcome", Outcome.FAILED))
 
 
 def _rows_of(trial: FrozenTrial, sweep: str) -> Iterator[dict[str, Any]]:
@@ -51,11 +65,12 @@ def _rows_of(trial: FrozenTrial, sweep: str) -> Iterator[dict[str, Any]]:
             yield constants | dict(zip(chunk, values, strict=True))
 
 
-def read_results(path: str | Path) -> pd.DataFrame:
+def read_results(path: str | Path, *, partial: bool = False) -> pd.DataFrame:
     """
     :param path: of an exported ``.csv`` (perhaps compressed) or ``.parquet`` file
+    :param partial: whether to keep what is not finished, if the file has such runs
     :return: its table, with the columns of :data:`~sb3_gae.sweep.results.COLUMNS`
-    :raises SweepError: if there is no such file, it is something else, or another version wrote it
+    :raises SweepError: if there is no such file, it is something else, another version wrote it, or runs in it are not whole
     """
     path = Path(path)
     try:
@@ -74,12 +89,14 @@ def read_results(path: str | Path) -> pd.DataFrame:
         raise SweepError(f"{path} is of format {written}, and this sb3-gae knows {FORMAT}; export it anew from its storage.")
     if missing := [name for name in COLUMNS if name not in table]:
         raise SweepError(f"{path} lacks the columns {', '.join(missing)}; export it anew from its storage.")
-    return _typed(table)
+    table = _typed(table)
+    check_runs(finished(table), str(path))
+    return table if partial else finished(table)
 
 
 def _read_csv(path: Path) -> pd.DataFrame:
     # Texts as they are: a commit may look like a number
-    return pd.read_csv(path, dtype=dict.fromkeys(_TEXT_COLUMNS, str), float_precision="round_trip")
+    return pd.read_csv(path, dtype=dict.fromkeys((*_TEXT_COLUMNS, STATE_COLUMN), str), float_precision="round_trip")
 
 
 def is_parquet(path: Path) -> bool:
@@ -109,7 +126,7 @@ def _typed(table: pd.DataFrame) -> pd.DataFrame:
     """The same types, whether from a study, CSV or Parquet."""
     types: dict[str, Any] = dict.fromkeys(COLUMNS, float)
     types |= dict.fromkeys(_COUNT_COLUMNS, "int64") | dict.fromkeys(_TEXT_COLUMNS, object)
-    table = table[list(COLUMNS)]
+    table = table[[*COLUMNS, *([STATE_COLUMN] if STATE_COLUMN in table else [])]]
     return table.fillna(dict.fromkeys(_TEXT_COLUMNS, "")).astype(types)
 
 
@@ -123,15 +140,16 @@ def select(
     iterations: int | None = None,
 ) -> pd.DataFrame:
     """
-    :param table: of results
+    :param table: of results; of partial ones those of finished cells count
     :param tasks: to keep; None for all, as below
     :param conditions: to keep
     :param gammas: to keep
     :param lambdas: to keep, beside cells of conditions without λ
     :param iterations: of the cells to keep
-    :return: one task's rows, with runs of one length and one set of overrides
+    :return: one task's rows, with runs of one length, one set of overrides, and one of settings
     :raises SweepError: if nothing is left, or several kinds are left that do not go together
     """
+    table = finished(table)
     if table.empty:
         raise SweepError("No cell has finished yet; see: python -m sb3_gae.sweep status")
     wanted = {
@@ -160,6 +178,7 @@ def select(
         if len(found) > 1:
             shown = ", ".join(map(_shown, found))
             raise SweepError(f"The selection mixes runs whose {column} differ ({shown}); choose one with {option}.")
+    check_alike(made_in(table), "leave out one of the files, or choose other --conditions, --gammas or --lambdas")
     return table
 
 
@@ -190,12 +209,3 @@ def rows_of_cells(table: pd.DataFrame, cells: Iterable[Cell]) -> pd.DataFrame:
     keys = {cell.key for cell in cells}
     own = [trial.trial for trial in trials.itertuples() if cell_of(trial).key in keys]
     return table[table["trial"].isin(own)].reset_index(drop=True)
-
-
-def cell_of(row: Any) -> Cell:
-    """
-    :param row: of a table of results
-    :return: the cell that it is of
-    """
-    gae_lambda = None if math.isnan(row.gae_lambda) else row.gae_lambda
-    return Cell(row.task, row.condition, row.gamma, gae_lambda, int(row.seed), int(row.iterations), row.overrides)

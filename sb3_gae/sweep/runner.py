@@ -3,13 +3,16 @@
 import contextlib
 import multiprocessing
 import queue
+import signal
 import threading
 import time
+from collections.abc import Iterator
 from typing import Any
 
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.ledger import Standing, Status
 from sb3_gae.sweep.liveness import patience_with
+from sb3_gae.sweep.machine import check_jobs, check_options
 from sb3_gae.sweep.patience import Patience
 from sb3_gae.sweep.plan import Plan
 from sb3_gae.sweep.progress import Progress
@@ -29,6 +32,7 @@ def check_plan(plan: Plan) -> dict[str, dict[str, Any]]:
     :return: the settings of each task, without overrides
     :raises SweepError: if something in it cannot be run
     """
+    check_options(plan.options)
     import_packages(plan.options.gym_packages)
     tasks = list(dict.fromkeys(cell.task for cell in plan.cells))
     check_tasks(tasks)
@@ -50,8 +54,7 @@ def run_plan(
     :return: where each cell of the plan stands, by its key
     :raises SweepError: if something in the plan cannot be run, or the storage cannot be used
     """
-    if jobs < 1:
-        raise SweepError(f"`jobs` must be at least 1, got {jobs}.")
+    check_jobs(jobs)
     if not plan.silent_after > 0.0:
         raise SweepError(f"`silent_after` must be a number of seconds above 0, got {plan.silent_after:g}.")
     settings = check_plan(plan)
@@ -120,6 +123,23 @@ def _run_here(plan: Plan, stop: StopRequest, bar: Progress, patience: Patience) 
         shower.join()
 
 
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """
+    Processes that are started here never hear of Ctrl-C, which comes to all at a terminal; they are asked to stop.
+
+    They would be interrupted while they still import. This process hears of it afterwards.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # on Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class _Pool:
     """
     Processes that each run one cell after another.
@@ -137,7 +157,8 @@ class _Pool:
 
     def _start(self) -> Any:
         process = self._context.Process(target=work_as_process, args=(self._plan, self._messages), daemon=True)
-        process.start()
+        with _without_interrupts():
+            process.start()
         return process
 
     def run(self, stop: StopRequest, bar: Progress) -> None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from sb3_gae.sweep.conditions import CONDITIONS
+from sb3_gae.sweep.conditions import CONDITIONS, find_condition
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Curve
 
@@ -17,11 +17,14 @@ SCORES = ("last", "training")
 class Series(NamedTuple):
     """
     :param curve: what the runs have in common
-    :param returns: mean return of the episodes of each iteration, shape (seeds, iterations)
+    :param returns: mean return of the episodes of each iteration, shape (seeds, iterations); the last known one where none
+        ended
+    :param ended: whether episodes ended in the iteration, shape (seeds, iterations)
     """
 
     curve: Curve
     returns: np.ndarray
+    ended: np.ndarray
 
     @property
     def n_seeds(self) -> int:
@@ -33,13 +36,20 @@ def series_of(table: pd.DataFrame) -> list[Series]:
     """
     :param table: results of one task, with runs of one length
     :return: one for each curve: in the order of conditions, γ rising, λ falling
+    :raises SweepError: if a condition is unknown, or runs of a curve do not have the same iterations, each once
     """
     found = []
     for (condition, gamma, gae_lambda), rows in table.groupby(["condition", "gamma", "gae_lambda"], dropna=False):
+        find_condition(condition)
+        # What is not there is no iteration without an episode, and must not be filled in
+        if rows.duplicated(["seed", "iteration"]).any() or len(rows) != rows["seed"].nunique() * rows["iteration"].max():
+            of_lambda = "" if math.isnan(gae_lambda) else f", λ = {gae_lambda:g}"
+            raise SweepError(f"Runs of {condition}, γ = {gamma:g}{of_lambda} are not whole, or there twice.")
         wide = rows.pivot(index="seed", columns="iteration", values="mean_return")
         # In some batches no episode ends; the last known return stands for them
         returns = wide.ffill(axis="columns").to_numpy()
-        found.append(Series(Curve(gamma, None if math.isnan(gae_lambda) else gae_lambda, condition), returns))
+        curve = Curve(gamma, None if math.isnan(gae_lambda) else gae_lambda, condition)
+        found.append(Series(curve, returns, wide.notna().to_numpy()))
     names = list(CONDITIONS)
     without_vf_first = {name: (CONDITIONS[name].uses_lambda, names.index(name)) for name in names}
     return sorted(

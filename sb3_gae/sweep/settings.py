@@ -52,8 +52,15 @@ def import_packages(gym_packages: Iterable[str]) -> None:
             importlib.import_module(name)
         except ImportError as error:
             raise SweepError(
-                f"`gym_packages`: {name} cannot be imported ({error}); run where it lies, or install it."
+                f"`gym_packages`: {name} cannot be imported ({_in_one_line(error)}); run where it lies, or install it."
             ) from error
+        except Exception as error:
+            what = f"{type(error).__name__}: {_in_one_line(error)}"
+            raise SweepError(f"`gym_packages`: {name} fails when it is imported ({what}); mend it first.") from error
+
+
+def _in_one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]
 
 
 def check_tasks(tasks: Iterable[str]) -> None:
@@ -64,7 +71,7 @@ def check_tasks(tasks: Iterable[str]) -> None:
     for task in tasks:
         if task not in gymnasium.registry:
             raise SweepError(
-                f"`env`: gymnasium does not know {task!r}{did_you_mean(task, gymnasium.registry)}. "
+                f"`env`: gymnasium does not know {task!r}{did_you_mean(task, gymnasium.registry)} "
                 "Environments of your own come with --gym-packages."
             )
 
@@ -82,7 +89,7 @@ def check_overrides(cells: Iterable[Cell]) -> None:
             if name in find_condition(condition).settings:
                 raise SweepError(f"`-params {name}` is what the condition {condition!r} sets; leave out one of them.")
             if name not in known:
-                raise SweepError(f"`-params` has no {name!r}{did_you_mean(name, known)}.")
+                raise SweepError(f"`-params` has no {name!r}{did_you_mean(name, known)}")
 
 
 def shipped_settings(task: str, conf_file: str | None = None) -> dict[str, Any]:

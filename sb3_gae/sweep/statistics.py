@@ -10,6 +10,8 @@ from scipy import stats
 
 CONFIDENCE = 0.95
 RESAMPLES = 2_000
+#: runs from which on the interquartile mean leaves some out; of fewer it is the mean
+TRIMMED_FROM = 4
 
 
 class Estimate(NamedTuple):

@@ -1,6 +1,7 @@
 """Optuna's storages: opened by path or URL, safe for many processes, and with errors of one line."""
 
 import contextlib
+import json
 import random
 import time
 from collections.abc import Iterator
@@ -35,6 +36,12 @@ _POSTGRESQL = {
     "keepalives_count": 3,
     "tcp_user_timeout": 60_000,  # milliseconds
 }
+#: of drivers whose packages have other names
+_PACKAGES_OF_DRIVERS = {"psycopg2": "psycopg2-binary", "mysqldb": "mysqlclient"}
+#: of a journal
+_BEGINNING = b'{"op_code":'
+#: seconds without growth after which a line that has no end counts as torn
+_SETTLE_SECONDS = 3.0
 
 
 class _TidyLock(JournalFileSymlinkLock):
@@ -54,29 +61,60 @@ class _TidyLock(JournalFileSymlinkLock):
     def acquire(self) -> bool:
         acquired = super().acquire()
         try:
-            _remove_torn_line(self._path)
+            while (whole := _size_of_whole_lines(self._path)) is not None:
+                _remove_torn_line(self._path, whole)
         except BaseException:
             self.release()
             raise
         return acquired
 
 
-def _remove_torn_line(path: Path) -> None:
-    with path.open("rb+") as file:
-        size = file.seek(0, 2)
-        if size == 0:
-            return
-        file.seek(size - 1)
-        if file.read(1) == b"\n":
-            return
-        start = max(0, size - 2**20)
-        while True:
+def _size_of_whole_lines(path: Path) -> int | None:
+    """:return: bytes until the end of the last whole line, None if nothing comes after it"""
+    with path.open("rb") as file:
+        size = start = file.seek(0, 2)
+        file.seek(max(0, size - 1))
+        if file.read(1) in (b"", b"\n"):
+            return None
+        while start > 0:
+            start = max(0, start - 2**20)
             file.seek(start)
             found = file.read(size - start).rfind(b"\n")
-            if found >= 0 or start == 0:
-                file.truncate(start + found + 1)
-                return
-            start = max(0, start - 2**20)
+            if found >= 0:
+                return start + found + 1
+    # Nothing of it is stored, but it may as well be somebody's file
+    raise ValueError("it has no whole line; remove it if it was to be a sweep")
+
+
+def _remove_torn_line(path: Path, whole: int) -> None:
+    """
+    Cut what comes after the whole lines, unless somebody still writes it.
+
+    Optuna takes the lock from a process that has held it for 30 s, dead or not. A line that is cut while its process writes
+    would be lost, and its rest would damage the journal. Each line is written by one call of the system, which does not
+    pause: one that has not grown for seconds has lost its writer.
+    """
+    before = path.stat().st_size
+    time.sleep(_SETTLE_SECONDS)
+    with path.open("rb+") as file:
+        if file.seek(0, 2) == before:
+            file.truncate(whole)
+
+
+def _check_is_journal(path: Path) -> None:
+    """:raises ValueError: if the file holds something else; an empty one may become a journal"""
+    if not path.exists():
+        return
+    with path.open("rb") as file:
+        first = file.readline(2**20)
+    if not first.endswith(b"\n") and _BEGINNING.startswith(first[: len(_BEGINNING)]):
+        return  # another process may be writing it
+    try:
+        entry = json.loads(first)
+    except ValueError:
+        entry = None
+    if not isinstance(entry, dict) or not {"op_code", "worker_id"} <= entry.keys():
+        raise ValueError("its first line is no entry of a journal")
 
 
 def open_storage(location: str, *, create: bool) -> optuna.storages.BaseStorage:
@@ -88,17 +126,20 @@ def open_storage(location: str, *, create: bool) -> optuna.storages.BaseStorage:
     """
     with storage_errors(location):
         if is_url(location):
-            return _open_database(location)
+            return _open_database(location, create)
         # Absolute: the lock is a symbolic link to the file, and a dangling one is never seen to grow old
         path = Path(location).absolute()
         if not create and not path.exists():
             raise SweepError(f"There is no sweep at {location}; run one first, or name its --storage.")
+        _check_is_journal(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         return optuna.storages.JournalStorage(JournalFileBackend(str(path), lock_obj=_TidyLock(path)))
 
 
-def _open_database(url: str) -> optuna.storages.BaseStorage:
+def _open_database(url: str, create: bool) -> optuna.storages.BaseStorage:
     parsed = parse_url(url)
+    if not create and not _is_begun(parsed):
+        raise SweepError(f"There is no sweep at {without_password(url)}; run one first, or name its --storage.")
     for attempt in range(_ATTEMPTS):
         try:
             storage = optuna.storages.RDBStorage(url, engine_kwargs=_engine_arguments(parsed))
@@ -124,6 +165,18 @@ def _engine_arguments(url: sqlalchemy.URL) -> dict[str, Any]:
     if url.drivername in ("postgresql", "postgresql+psycopg", "postgresql+psycopg2"):
         arguments["connect_args"] = {name: value for name, value in _POSTGRESQL.items() if name not in url.query}
     return arguments
+
+
+def _is_begun(url: sqlalchemy.URL) -> bool:
+    """Whether a database has Optuna's tables: to look, Optuna would make them, and SQLite its file."""
+    is_file = url.get_backend_name() == "sqlite" and url.database and not url.database.startswith((":memory:", "file:"))
+    if is_file and not Path(str(url.database)).exists():
+        return False
+    engine = sqlalchemy.create_engine(url, **_engine_arguments(url))
+    try:
+        return sqlalchemy.inspect(engine).has_table("studies")
+    finally:
+        engine.dispose()
 
 
 def _begin_with_a_lock(engine: sqlalchemy.Engine) -> None:
@@ -192,9 +245,14 @@ def _explain(location: str, error: Exception) -> str:
 
 
 def _driver_of(location: str) -> str:
-    if not location.startswith("postgresql"):
+    """How to get it, empty if the location does not tell."""
+    if location.startswith("postgresql"):
+        return ' (pip install "sb3-gae[postgresql]", and a URL that begins with postgresql+psycopg://)'
+    try:
+        name = sqlalchemy.make_url(location).get_driver_name()
+    except SQLAlchemyError:
         return ""
-    return ' (pip install "sb3-gae[postgresql]", and a URL that begins with postgresql+psycopg://)'
+    return f" (pip install {_PACKAGES_OF_DRIVERS.get(name, name)})"
 
 
 def _advice(location: str, cause: BaseException) -> str:
@@ -217,4 +275,6 @@ def holds(location: str, study: str) -> bool:
     if not is_url(location) and not Path(location).exists():
         return False
     with storage_errors(location):
+        if is_url(location) and not _is_begun(parse_url(location)):
+            return False
         return study in optuna.get_all_study_names(open_storage(location, create=False))

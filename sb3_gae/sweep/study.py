@@ -1,6 +1,7 @@
 """A sweep as an Optuna study: cells are trials, shared by every process that opens the same storage."""
 
 import datetime
+import json
 import math
 import time
 import warnings
@@ -13,6 +14,7 @@ from optuna.distributions import BaseDistribution, FloatDistribution, IntDistrib
 from optuna.exceptions import UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
+from sb3_gae.sweep.agreement import Made, changes, check_made_with
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Cell
 from sb3_gae.sweep.ledger import Outcome, Standing, Status, duplicates, standings
@@ -128,15 +130,29 @@ class SweepStudy:
         for task, now in settings.items():
             before = stored.get(f"settings:{task}")
             if before is None:
+                # Runs may have been imported
+                check_made_with(self.made(), {task: now}, "choose another --name, or go back to theirs with --conf-file")
                 self.ask(self._study.set_user_attr, f"settings:{task}", dict(now))
                 continue
-            changed = [name for name in sorted({*before, *now}) if before.get(name) != now.get(name)]
-            if changed:
-                what = ", ".join(f"{name} {before.get(name)!r} -> {now.get(name)!r}" for name in changed)
+            if what := changes(before, now):
                 raise SweepError(
                     f"The settings of {task} have changed since the sweep {self.name!r} began ({what}); "
                     "choose another --name, or go back to them with --conf-file."
                 )
+
+    def task_settings(self) -> dict[str, Mapping[str, Any]]:
+        """:return: what :meth:`check_settings` remembers"""
+        stored = self.ask(lambda: self._study.user_attrs)
+        return {name.removeprefix("settings:"): stored[name] for name in stored if name.startswith("settings:")}
+
+    def made(self) -> list[Made]:
+        """:return: how each finished cell was made"""
+        done = [standing.trial for standing in self.standings().values() if standing.status == Status.DONE]
+        return [
+            Made(cell["task"], cell["condition"], cell["overrides"], json.dumps(trial.user_attrs.get("settings", {})))
+            for trial in done
+            if trial is not None and (cell := trial.user_attrs["cell"])
+        ]
 
     def enqueue(self, cells: Iterable[Cell], *, retry_failed: bool = False) -> None:
         """

@@ -148,12 +148,16 @@ def run_claim(claim: Claim, options: Options, stop: StopRequest) -> None:
     except SweepError:
         raise
     except Exception as error:
-        _give_up(claim, curve, Outcome.FAILED, _in_one_line(error))
+        # Its end is the innermost, and a database may have no room for more
+        _give_up(
+            claim, curve, Outcome.FAILED, _in_one_line(error), traceback="".join(traceback.format_exception(error))[-20_000:]
+        )
 
 
-def _give_up(claim: Claim, curve: "_CurveWriter", outcome: Outcome, reason: str) -> None:
+def _give_up(claim: Claim, curve: "_CurveWriter", outcome: Outcome, reason: str, **what: Any) -> None:
     try:
         curve.flush()
+        claim.describe(**what)
         claim.give_up(outcome, f"{reason} (after iteration {curve.n_rows} of {claim.cell.iterations})")
     except TakenOverError:
         pass

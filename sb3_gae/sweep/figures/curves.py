@@ -1,5 +1,7 @@
 """Learning curves."""
 
+from typing import Any
+
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
@@ -7,14 +9,16 @@ from matplotlib.ticker import MaxNLocator
 
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.figures.style import RETURN_LABEL, line_styles, new_figure
-from sb3_gae.sweep.figures.wording import label_of, seeds, what
-from sb3_gae.sweep.series import series_of
+from sb3_gae.sweep.figures.wording import label_of, mean_over_seeds, what
+from sb3_gae.sweep.series import Series, series_of
 from sb3_gae.sweep.statistics import estimate
 
 
 def curves_figure(table: pd.DataFrame) -> Figure:
     """
     Interquartile mean over seeds at each iteration, and its bootstrap interval of 95 % as a band.
+
+    Where episodes end in fewer than half of all iterations, as those of environments in step do, dots say in which.
 
     :param table: selected by :func:`~sb3_gae.sweep.results.select`
     :return: the figure
@@ -30,7 +34,7 @@ def curves_figure(table: pd.DataFrame) -> Figure:
             raise SweepError("There are no curves to draw: in some runs no episode has ended; run more --iterations.")
         iterations = 1 + np.flatnonzero(known)
         result = estimate(one.returns[:, known])
-        axes.plot(iterations, result.iqm, label=label_of(one.curve, series), zorder=3, **style)
+        axes.plot(iterations, result.iqm, label=label_of(one.curve, series), zorder=3, **style, **_dots(one, known))
         axes.fill_between(iterations, result.low, result.high, color=style["color"], alpha=0.13, linewidth=0)
     axes.set_xlabel("iteration (batch)")
     axes.set_ylabel(RETURN_LABEL)
@@ -38,5 +42,18 @@ def curves_figure(table: pd.DataFrame) -> Figure:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.25)
     axes.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=9)
-    axes.set_title(f"{what(table, series)}\nIQM over {seeds(series)}, bands: 95 % bootstrap intervals")
+    dots = ", dots: episodes ended" if any(_is_sparse(one) for one in series) else ""
+    axes.set_title(f"{what(table, series)}\n{mean_over_seeds(series)}, bands: 95 % bootstrap intervals{dots}")
     return figure
+
+
+def _is_sparse(one: Series) -> bool:
+    return float(one.ended.any(axis=0).mean()) < 0.5
+
+
+def _dots(one: Series, known: np.ndarray) -> dict[str, Any]:
+    """Of a line that would otherwise look as if each of its steps were measured."""
+    if not _is_sparse(one):
+        return {}
+    places = np.flatnonzero(one.ended[:, known].any(axis=0))
+    return {"marker": "o", "markersize": 4.0, "markevery": places.tolist()}

@@ -1,5 +1,6 @@
 """Figures into files."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -27,6 +28,8 @@ def write_figure(kind: str, table: pd.DataFrame, output: Path, iteration: int | 
     :return: paths of the files
     :raises SweepError: if there is nothing to show, or a file cannot be written
     """
+    if output.suffix not in SUFFIXES and re.fullmatch(r"\.[A-Za-z]{2,}", output.suffix):
+        raise SweepError(f"`output` must end in {' or '.join(SUFFIXES)}, or have no ending for both, got {output.name!r}.")
     paths = [output] if output.suffix in SUFFIXES else [output.with_name(output.name + suffix) for suffix in SUFFIXES]
     with rc_context(STYLE):
         figure = FIGURES[kind](table) if kind == "curves" else FIGURES[kind](table, iteration, by)

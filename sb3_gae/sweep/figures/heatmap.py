@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from sb3_gae.sweep.figures.style import RED, new_figure, readable_on
-from sb3_gae.sweep.figures.wording import best, rounded, what
+from sb3_gae.sweep.figures.wording import best, mean_name, rounded, what
 from sb3_gae.sweep.series import Series, scores_of, series_of, with_lambda
 from sb3_gae.sweep.statistics import estimate_each
 
@@ -44,7 +44,7 @@ def heatmap_figure(table: pd.DataFrame, iteration: int | None = None, by: str = 
     axes.set_xlabel("λ")
     axes.set_ylabel("γ", rotation=0, labelpad=10)
     axes.spines[:].set_visible(False)
-    colorbar = figure.colorbar(mesh, ax=axes, label=f"mean return {when} (IQM)", pad=0.02)
+    colorbar = figure.colorbar(mesh, ax=axes, label=f"mean return {when} ({mean_name(series)})", pad=0.02)
     colorbar.outline.set_visible(False)
     axes.set_title(f"{what(table, series)}\nbest (framed): {best(series[first].curve, results[first])}")
     return figure

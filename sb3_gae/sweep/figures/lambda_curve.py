@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from sb3_gae.sweep.conditions import CONDITIONS
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.figures.style import RED, RETURN_LABEL, new_figure, style_without_lambda
-from sb3_gae.sweep.figures.wording import best, seeds, what
+from sb3_gae.sweep.figures.wording import best, mean_over_seeds, what
 from sb3_gae.sweep.series import Series, scores_of, series_of, with_lambda
 from sb3_gae.sweep.statistics import Estimate, estimate_each
 
@@ -47,7 +47,7 @@ def lambda_figure(table: pd.DataFrame, iteration: int | None = None, by: str = "
     right.set_ylabel(RETURN_LABEL)
     axes.grid(alpha=0.25)
     axes.legend(loc="best", fontsize=9)
-    shown = f"IQM over {seeds([*series, *without])}, band: 95 % bootstrap interval"
+    shown = f"{mean_over_seeds([*series, *without])}, band: 95 % bootstrap interval"
     axes.set_title(f"{what(table, series)}\nbest: {best(series[first].curve, of_lambda[first])}\n{shown}")
     return figure
 

@@ -8,7 +8,7 @@ import pandas as pd
 from sb3_gae.sweep.conditions import CONDITIONS
 from sb3_gae.sweep.grid import Curve
 from sb3_gae.sweep.series import Series
-from sb3_gae.sweep.statistics import Estimate
+from sb3_gae.sweep.statistics import TRIMMED_FROM, Estimate
 
 
 def label_of(curve: Curve, series: Sequence[Series]) -> str:
@@ -50,6 +50,24 @@ def seeds(series: Sequence[Series]) -> str:
     if len(counts) > 1:
         return f"{counts[0]} to {counts[-1]} seeds"
     return f"{counts[0]} seed{'s' if counts[0] > 1 else ''}"
+
+
+def mean_name(series: Sequence[Series]) -> str:
+    """
+    :param series: that a figure shows
+    :return: what the interquartile mean is of so many runs
+    """
+    return "IQM" if max(one.n_seeds for one in series) >= TRIMMED_FROM else "mean"
+
+
+def mean_over_seeds(series: Sequence[Series]) -> str:
+    """
+    :param series: that a figure shows
+    :return: which mean it shows, of how many runs
+    """
+    name = mean_name(series)
+    mixed = name == "IQM" and min(one.n_seeds for one in series) < TRIMMED_FROM
+    return f"{name} over {seeds(series)}" + (f" (of fewer than {TRIMMED_FROM} the mean)" if mixed else "")
 
 
 def best(curve: Curve, result: Estimate) -> str:
