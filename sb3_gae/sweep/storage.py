@@ -17,7 +17,7 @@ from sb3_gae.sweep.errors import SweepError
 #: seconds that a process waits for another one's write
 _LOCK_SECONDS = 60
 #: of drivers whose packages have other names
-_PACKAGES_OF_DRIVERS = {"psycopg2": "psycopg2-binary", "mysqldb": "mysqlclient"}
+_PACKAGES_OF_DRIVERS = {"psycopg2": "psycopg2-binary", "psycopg": '"psycopg[binary]"', "mysqldb": "mysqlclient"}
 #: of a journal
 _BEGINNING = b'{"op_code":'
 #: seconds without growth after which a line that has no end counts as torn
