@@ -311,6 +311,14 @@ def test_storages_that_cannot_be_used(location: str, message: str, tmp_path: Pat
     assert (tmp_path / "file").read_text() == "these are\nno results\n"
 
 
+@pytest.mark.parametrize("driver", ["psycopg2", "psycopg"])
+def test_a_missing_driver_is_named(driver: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, driver, None)  # as if it were not installed
+    with pytest.raises(SweepError) as error:
+        SweepStudy("s", f"postgresql+{driver}://me:secret@localhost/x")
+    assert f"needs a driver that is not installed: {driver}; pip install" in str(error.value)
+
+
 def test_a_locked_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     location = f"sqlite:///{tmp_path}/sweep.db"
     SweepStudy("s", location)
