@@ -312,11 +312,11 @@ def test_storages_that_cannot_be_used(location: str, message: str, tmp_path: Pat
 
 
 @pytest.mark.parametrize("driver", ["psycopg2", "psycopg"])
-def test_a_missing_driver_is_named(driver: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_how_to_get_a_missing_driver_is_said(driver: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, driver, None)  # as if it were not installed
     with pytest.raises(SweepError) as error:
         SweepStudy("s", f"postgresql+{driver}://me:secret@localhost/x")
-    assert f"needs a driver that is not installed: {driver}; pip install" in str(error.value)
+    assert 'needs a driver that is not installed (pip install "sb3-gae[postgresql]"' in str(error.value)
 
 
 def test_a_locked_database(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

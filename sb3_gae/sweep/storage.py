@@ -37,7 +37,7 @@ _POSTGRESQL = {
     "tcp_user_timeout": 60_000,  # milliseconds
 }
 #: of drivers whose packages have other names
-_PACKAGES_OF_DRIVERS = {"psycopg2": "psycopg2-binary", "psycopg": '"psycopg[binary]"', "mysqldb": "mysqlclient"}
+_PACKAGES_OF_DRIVERS = {"mysqldb": "mysqlclient"}
 #: of a journal
 _BEGINNING = b'{"op_code":'
 #: seconds without growth after which a line that has no end counts as torn
