@@ -15,6 +15,8 @@ from sb3_gae.vec_env.choice import batched_vec_env
 
 BATCH = 12_288
 N_ENVS, N_STEPS = 64, 64
+#: one whose physics takes most of a rollout, and one whose physics takes little: there what is done around it shows
+ROLLOUT_TASKS = ("GaeBiped-v0", "GaeCartPole-v0")
 ROUNDS = 9
 
 
@@ -23,7 +25,7 @@ def speed_ratios() -> dict[str, float]:
     :return: by name; the smaller the faster
     """
     th.set_num_threads(1)
-    return update_ratios() | rollout_ratio()
+    return update_ratios() | {f"rollout / physics, {task}": rollout_ratio(task) for task in ROLLOUT_TASKS}
 
 
 def update_ratios() -> dict[str, float]:
@@ -55,11 +57,12 @@ def update_ratios() -> dict[str, float]:
     }
 
 
-def rollout_ratio() -> dict[str, float]:
+def rollout_ratio(task: str) -> float:
     """
-    :return: a rollout of the biped over stepping the same environments with given actions
+    :param task: id
+    :return: a rollout over stepping the same environments with given actions
     """
-    env = make_vec_env("GaeBiped-v0", N_ENVS, seed=0, vec_env_cls=batched_vec_env, vec_env_kwargs={"n_threads": 1})
+    env = make_vec_env(task, N_ENVS, seed=0, vec_env_cls=batched_vec_env, vec_env_kwargs={"n_threads": 1})
     model = TRPOGAE("MlpPolicy", env, n_steps=N_STEPS, seed=0, device="cpu")
     _, callback = model._setup_learn(N_ENVS * N_STEPS)
     callback.on_training_start(locals(), globals())
@@ -70,7 +73,7 @@ def rollout_ratio() -> dict[str, float]:
             "physics": (lambda: [env.step(action) for action in actions], None),
         }
     )
-    return {"rollout / physics": times["rollout"] / times["physics"]}
+    return times["rollout"] / times["physics"]
 
 
 def forward_and_backward(model: TRPOGAE) -> None:
