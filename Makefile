@@ -5,7 +5,7 @@
 #   make check                     formatting, lint, types
 #   make format                    put formatting right
 #   make docs                      build the book into docs/_build/html; a warning is an error
-#   make bench                     speed of an update beside sb3-contrib's
+#   make bench                     the gate: has anything become slower, or does it learn less? A minute
 #   make bench-full                also speed of whole iterations and of each part, what the shipped settings reach, and peers (days)
 #   make clean                     remove .venv and what builds and tools left
 #   make PYTHON=python3.12 train   choose an interpreter
@@ -66,9 +66,10 @@ docs: $(STAMP)
 	$(IN_VENV) sphinx-build --fail-on-warning --keep-going -b doctest docs docs/_build/doctest
 
 bench: $(STAMP)
-	$(IN_VENV) python benchmarks/update_speed.py $(ARGS)
+	$(IN_VENV) python -m benchmarks.gate $(ARGS)
 
 bench-full: bench $(TIANSHOU)/.installed
+	$(IN_VENV) python benchmarks/update_speed.py
 	$(IN_VENV) python benchmarks/rollout_speed.py
 	$(IN_VENV) python -m benchmarks.speed run
 	$(IN_VENV) python -m benchmarks.speed profile

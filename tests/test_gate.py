@@ -10,8 +10,10 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.gate.bands import LEARNING_DEVIATIONS, SPEED_MARGIN, Band, learning_band, speed_band, verdicts
+from benchmarks.gate.learning import RUNS, SEEDS
 from benchmarks.gate.plants import PLANTS, twice
-from benchmarks.gate.records import read_records
+from benchmarks.gate.records import bands, read_records
+from benchmarks.gate.speed import ROLLOUT_TASKS
 
 
 def test_a_band_for_learning_reaches_as_far_as_the_error_of_two_means() -> None:
@@ -65,3 +67,13 @@ def test_without_a_record_the_gate_says_what_to_do(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr("benchmarks.gate.records.RECORDS", tmp_path / "gate.json")
     with pytest.raises(SystemExit, match=r"python -m benchmarks\.gate record"):
         read_records()
+
+
+def test_the_records_cover_what_is_measured_with_seeds_of_their_own() -> None:
+    records = read_records()
+    assert set(records["learning"]) == set(RUNS)
+    for scores in records["learning"].values():
+        assert len(scores) >= 20 and not {int(seed) for seed in scores} & set(SEEDS)
+    assert {f"rollout / physics, {task}" for task in ROLLOUT_TASKS} < set(records["speed"])
+    assert all(len(ratios) >= 10 for ratios in records["speed"].values())
+    assert all(band.low < band.high for part in records if part != "of" for band in bands(records, part, len(SEEDS)).values())
