@@ -26,7 +26,8 @@ def draw(history: Path = HISTORY, figure_path: Path = FIGURE) -> Path:
     for axis, name in zip(axes.flat, names, strict=False):
         of = table[table["name"] == name]
         places = range(len(of))
-        axis.fill_between(places, of["low"], of["high"], alpha=0.2, step="mid", linewidth=0)
+        # Bars, since an area between single points is none
+        axis.vlines(places, of["low"], of["high"], alpha=0.2, linewidth=10)
         axis.plot(places, of["value"], "o-", markersize=4)
         axis.set_xticks(places, [commit[:7] for commit in of["commit"].fillna("")], rotation=60, fontsize=7)
         axis.set_title(name, fontsize=9)
