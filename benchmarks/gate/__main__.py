@@ -91,7 +91,8 @@ def record(parts: Sequence[str]) -> None:
         records["learning"] = {
             name: {str(seed): round(learning_scores(name, [seed])[0], 2) for seed in RECORDED_SEEDS} for name in RUNS
         }
-    records["of"] = provenance()
+    # Parts are recorded at different times, and so of different commits
+    records["of"] = records.get("of", {}) | {part: provenance() for part in parts}
     write_records(records)
 
 
