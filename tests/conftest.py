@@ -1,11 +1,17 @@
-"""Settings of all tests."""
+"""Settings of all tests, and fixtures that several files need."""
 
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch as th
 from hypothesis import settings
+from pendulum_task import PENDULUM
+from resuming import train
+from saved_models import saved, trained_model
+
+from sb3_gae import TRPOGAE
 
 # Small networks: more threads would only fight over the cores
 th.set_num_threads(1)
@@ -29,3 +35,29 @@ def interruptible() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def pendulum(tmp_path: Path) -> Path:
+    path = tmp_path / "pendulum.xml"
+    path.write_text(PENDULUM)
+    return path
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the last three checkpoints of a training of four iterations; tests copy what they change."""
+    folder = tmp_path_factory.mktemp("trained")
+    train(folder, 4)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def some_model() -> TRPOGAE:
+    """Trained; tests leave it as it is."""
+    return trained_model()
+
+
+@pytest.fixture(scope="module")
+def model_file(some_model: TRPOGAE) -> bytes:
+    return saved(some_model)

@@ -182,6 +182,11 @@ def small_model(env: VecEnv, policy: Any = None, **kwargs: Any) -> TRPOGAE:
     return TRPOGAE(policy or policy_name(env.observation_space), env, **kwargs)
 
 
+def short_model(env: Any = None, policy: Any = "MlpPolicy", **kwargs: Any) -> TRPOGAE:
+    """Its rollouts have 8 steps."""
+    return small_model(env or vec_env(), policy, **({"n_steps": 8} | kwargs))
+
+
 def check_training(model: TRPOGAE, iterations: int = 2) -> None:
     """Each update moves the policy, by as much as is logged and no more than allowed, and actions lie in their space."""
     for _ in range(iterations):

@@ -1,6 +1,7 @@
 """Trainings for the tests of checkpoints: short ones of many kinds, and what must be the same in the end."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -10,7 +11,8 @@ from envs_for_tests import SMALL, AnySpacesEnv
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from sb3_gae import TRPOGAE, MujocoVecEnv
+from sb3_gae import TRPOGAE, MujocoVecEnv, ResumableCheckpointCallback
+from sb3_gae.saving.checkpoint_file import checkpoints_in
 
 #: two environments take so many steps in an iteration
 STEPS = 2 * 32
@@ -75,3 +77,22 @@ def differences(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
     """Names of what is not the same bit for bit."""
     assert one.keys() == other.keys()
     return [name for name in one if not np.array_equal(np.asarray(one[name]), np.asarray(other[name]))]
+
+
+def train(folder: Path, iterations: int = 3, **kwargs: Any) -> TRPOGAE:
+    """With checkpoints in ``folder``, after each iteration if ``kwargs`` say nothing else."""
+    model = make_model(cart_poles())
+    return model.learn(
+        iterations * STEPS, callback=ResumableCheckpointCallback(**({"save_freq": 1, "save_path": folder} | kwargs))
+    )
+
+
+def steps_in(folder: Path) -> list[int]:
+    """After how many iterations the checkpoints were written, the newest first."""
+    return [int(path.name.split("_")[-2]) // STEPS for path in checkpoints_in(folder)]
+
+
+def copy_of(folder: Path, to: Path) -> list[Path]:
+    for path in folder.iterdir():
+        (to / path.name).write_bytes(path.read_bytes())
+    return checkpoints_in(to)

@@ -1,4 +1,4 @@
-"""A saved model comes back whole, and a file that is not one changes nothing."""
+"""A saved model comes back whole, and goes on."""
 
 import io
 import json
@@ -11,92 +11,38 @@ import numpy as np
 import pytest
 import sb3_contrib
 import torch as th
-from envs_for_tests import (
-    SMALL,
-    VECTOR,
-    AnySpacesEnv,
-    KLProbe,
-    differing,
-    optimizer_state,
-    state_of,
-    train_once,
-    vec_env,
-)
+from envs_for_tests import SMALL, VECTOR, AnySpacesEnv, KLProbe, differing, state_of, train_once, vec_env
 from gymnasium import spaces
-from stable_baselines3 import PPO
-from stable_baselines3.common.base_class import BaseAlgorithm
+from saved_models import OBSERVATIONS, check_same, saved, trained_model, values_and_actions
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_gae import TRPOGAE, GAERolloutBuffer, MlpPolicy
-from sb3_gae.hyperparameters import FOREIGN_ARGUMENTS
-
-OBSERVATIONS = np.random.default_rng(0).uniform(-1, 1, (64, 3)).astype(np.float32)
-
-
-def trained_model(**kwargs: Any) -> TRPOGAE:
-    model = TRPOGAE("MlpPolicy", vec_env(), **({"n_steps": 16, "policy_kwargs": SMALL, "seed": 0} | kwargs))
-    train_once(model)
-    train_once(model)
-    return model
-
-
-def fresh_model(**kwargs: Any) -> TRPOGAE:
-    return TRPOGAE("MlpPolicy", vec_env(), **({"n_steps": 16, "policy_kwargs": SMALL, "seed": 1} | kwargs))
-
-
-def saved(model: BaseAlgorithm) -> bytes:
-    file = io.BytesIO()
-    model.save(file)
-    return file.getvalue()
-
-
-@pytest.fixture(scope="module")
-def model() -> TRPOGAE:
-    """Trained; tests leave it as it is."""
-    return trained_model()
-
-
-@pytest.fixture(scope="module")
-def file(model: TRPOGAE) -> bytes:
-    return saved(model)
-
-
-def values_and_actions(model: Any) -> tuple[np.ndarray, np.ndarray]:
-    values = model.policy.predict_values(th.as_tensor(OBSERVATIONS)).detach().numpy()
-    return values, model.predict(OBSERVATIONS, deterministic=True)[0]
-
-
-def check_same(loaded: TRPOGAE, model: TRPOGAE) -> None:
-    assert differing(state_of(model.policy), state_of(loaded.policy)) == []
-    for mine, theirs in zip(values_and_actions(model), values_and_actions(loaded), strict=True):
-        np.testing.assert_array_equal(mine, theirs)
-
 
 # There and back
 
 
 @pytest.mark.parametrize("name", ["model", "model.zip", "with.dot", "folder/model"])
 @pytest.mark.parametrize("kind", [str, Path])
-def test_a_model_comes_back_from_a_path(kind: type, name: str, model: TRPOGAE, tmp_path: Path) -> None:
+def test_a_model_comes_back_from_a_path(kind: type, name: str, some_model: TRPOGAE, tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     path = kind(tmp_path / name)
-    model.save(path)
-    check_same(TRPOGAE.load(path), model)
+    some_model.save(path)
+    check_same(TRPOGAE.load(path), some_model)
 
 
-def test_a_model_comes_back_from_memory_and_from_an_open_file(model: TRPOGAE, tmp_path: Path) -> None:
+def test_a_model_comes_back_from_memory_and_from_an_open_file(some_model: TRPOGAE, tmp_path: Path) -> None:
     memory = io.BytesIO()
-    model.save(memory)
+    some_model.save(memory)
     memory.seek(0)
-    check_same(TRPOGAE.load(memory), model)
+    check_same(TRPOGAE.load(memory), some_model)
     (tmp_path / "file").write_bytes(memory.getvalue())
     with (tmp_path / "file").open("rb") as opened:
-        check_same(TRPOGAE.load(opened), model)
+        check_same(TRPOGAE.load(opened), some_model)
         assert not opened.closed
 
 
-def test_settings_and_counters_come_back(file: bytes) -> None:
+def test_settings_and_counters_come_back(model_file: bytes) -> None:
     settings: dict[str, Any] = {
         **dict(gamma=0.9, gae_lambda=0.8, value_lambda=0.7, target_kl=0.02, vf_trust_region=0.1, vf_steps=2, n_steps=16),
         **dict(cg_max_steps=3, vf_cg_max_steps=4, cg_damping=0.2, vf_cg_damping=0.3, curvature_samples=20),
@@ -111,16 +57,16 @@ def test_settings_and_counters_come_back(file: bytes) -> None:
     assert loaded.rollout_buffer.gamma == 0.9 and loaded.rollout_buffer_class is GAERolloutBuffer
 
 
-def test_the_file_holds_no_rollout_and_no_environment(file: bytes) -> None:
-    data = json.loads(zipfile.ZipFile(io.BytesIO(file)).read("data"))
+def test_the_file_holds_no_rollout_and_no_environment(model_file: bytes) -> None:
+    data = json.loads(zipfile.ZipFile(io.BytesIO(model_file)).read("data"))
     assert not {"rollout_buffer", "env", "policy", "_logger", "device"} & data.keys()
     theirs = sb3_contrib.TRPO("MlpPolicy", vec_env(), n_steps=16, batch_size=32, policy_kwargs=SMALL)
     assert json.loads(zipfile.ZipFile(io.BytesIO(saved(theirs))).read("data")).keys() - data.keys() == set()
 
 
-def test_save_leaves_out_and_takes_in_what_is_asked(model: TRPOGAE) -> None:
+def test_save_leaves_out_and_takes_in_what_is_asked(some_model: TRPOGAE) -> None:
     file = io.BytesIO()
-    model.save(file, exclude=["tensorboard_log"], include=["_custom_logger"])
+    some_model.save(file, exclude=["tensorboard_log"], include=["_custom_logger"])
     data = json.loads(zipfile.ZipFile(file).read("data"))
     assert "tensorboard_log" not in data and "_custom_logger" in data
 
@@ -150,19 +96,19 @@ def test_a_model_of_dict_observations_comes_back() -> None:
     train_once(loaded)
 
 
-def test_a_loaded_model_goes_through_pickle(file: bytes) -> None:
-    loaded = TRPOGAE.load(io.BytesIO(file))
+def test_a_loaded_model_goes_through_pickle(model_file: bytes) -> None:
+    loaded = TRPOGAE.load(io.BytesIO(model_file))
     again = pickle.loads(pickle.dumps(loaded))
     check_same(again, loaded)
 
 
-def test_a_policy_comes_back_on_its_own(model: TRPOGAE, tmp_path: Path) -> None:
-    model.policy.save(tmp_path / "policy")
+def test_a_policy_comes_back_on_its_own(some_model: TRPOGAE, tmp_path: Path) -> None:
+    some_model.policy.save(tmp_path / "policy")
     policy = MlpPolicy.load(tmp_path / "policy")
-    assert differing(state_of(model.policy), state_of(policy)) == []
-    np.testing.assert_array_equal(policy.predict(OBSERVATIONS, deterministic=True)[0], values_and_actions(model)[1])
+    assert differing(state_of(some_model.policy), state_of(policy)) == []
+    np.testing.assert_array_equal(policy.predict(OBSERVATIONS, deterministic=True)[0], values_and_actions(some_model)[1])
     th.testing.assert_close(
-        policy.predict_values(th.as_tensor(OBSERVATIONS)), th.as_tensor(values_and_actions(model)[0]), rtol=0, atol=0
+        policy.predict_values(th.as_tensor(OBSERVATIONS)), th.as_tensor(values_and_actions(some_model)[0]), rtol=0, atol=0
     )
 
 
@@ -188,8 +134,8 @@ def test_training_after_loading_is_training_without_having_stopped(vf_optimizer:
     assert loaded._n_updates == 3
 
 
-def test_counting_starts_anew_if_asked(file: bytes) -> None:
-    loaded = TRPOGAE.load(io.BytesIO(file), env=vec_env())
+def test_counting_starts_anew_if_asked(model_file: bytes) -> None:
+    loaded = TRPOGAE.load(io.BytesIO(model_file), env=vec_env())
     loaded.learn(32, reset_num_timesteps=False)
     assert loaded.num_timesteps == 96
     loaded.learn(32)
@@ -197,31 +143,33 @@ def test_counting_starts_anew_if_asked(file: bytes) -> None:
 
 
 @pytest.mark.parametrize("n_envs", [1, 3])
-def test_a_model_goes_on_with_another_number_of_environments(n_envs: int, file: bytes) -> None:
-    loaded = TRPOGAE.load(io.BytesIO(file), env=vec_env(n_envs=n_envs))
+def test_a_model_goes_on_with_another_number_of_environments(n_envs: int, model_file: bytes) -> None:
+    loaded = TRPOGAE.load(io.BytesIO(model_file), env=vec_env(n_envs=n_envs))
     probe = KLProbe()
     logged = train_once(loaded, probe)
     assert loaded.rollout_buffer.rewards.shape == (16, n_envs)
     assert probe.kl() == pytest.approx(logged["train/kl_divergence_loss"], rel=1e-3)
 
 
-def test_a_loaded_model_takes_an_environment_later(file: bytes) -> None:
-    loaded = TRPOGAE.load(io.BytesIO(file))
+def test_a_loaded_model_takes_an_environment_later(model_file: bytes) -> None:
+    loaded = TRPOGAE.load(io.BytesIO(model_file))
     assert loaded.get_env() is None
     loaded.set_env(vec_env())
     train_once(loaded)
 
 
-def test_an_environment_with_other_spaces_is_refused(file: bytes) -> None:
+def test_an_environment_with_other_spaces_is_refused(model_file: bytes) -> None:
     other = vec_env(lambda: AnySpacesEnv(spaces.Box(-1, 1, (4,), np.float32)))
     with pytest.raises(ValueError, match="Observation spaces do not match"):
-        TRPOGAE.load(io.BytesIO(file), env=other)
+        TRPOGAE.load(io.BytesIO(model_file), env=other)
     with pytest.raises(ValueError, match="Observation spaces do not match"):
-        TRPOGAE.load(io.BytesIO(file)).set_env(other)
+        TRPOGAE.load(io.BytesIO(model_file)).set_env(other)
 
 
-def test_settings_can_be_replaced_while_loading(file: bytes) -> None:
-    loaded = TRPOGAE.load(io.BytesIO(file), env=vec_env(), n_steps=8, target_kl=1e-4, vf_steps=1, gamma=0.5, gae_lambda=0.3)
+def test_settings_can_be_replaced_while_loading(model_file: bytes) -> None:
+    loaded = TRPOGAE.load(
+        io.BytesIO(model_file), env=vec_env(), n_steps=8, target_kl=1e-4, vf_steps=1, gamma=0.5, gae_lambda=0.3
+    )
     logged = train_once(loaded)
     assert loaded.rollout_buffer.rewards.shape == (8, 2)
     assert (loaded.rollout_buffer.gamma, loaded.rollout_buffer.gae_lambda) == (0.5, 0.3)
@@ -229,13 +177,13 @@ def test_settings_can_be_replaced_while_loading(file: bytes) -> None:
     assert logged["train/vf_steps"] <= 1
 
 
-def test_settings_that_replace_are_checked_too(file: bytes) -> None:
+def test_settings_that_replace_are_checked_too(model_file: bytes) -> None:
     with pytest.raises(ValueError, match="`target_kl`"):
-        TRPOGAE.load(io.BytesIO(file), target_kl=-1.0)
+        TRPOGAE.load(io.BytesIO(model_file), target_kl=-1.0)
 
 
-def test_custom_objects_replace_what_was_saved(file: bytes) -> None:
-    loaded = TRPOGAE.load(io.BytesIO(file), custom_objects={"gamma": 0.5, "learning_rate": 0.7})
+def test_custom_objects_replace_what_was_saved(model_file: bytes) -> None:
+    loaded = TRPOGAE.load(io.BytesIO(model_file), custom_objects={"gamma": 0.5, "learning_rate": 0.7})
     assert loaded.gamma == loaded.rollout_buffer.gamma == 0.5
     assert loaded.lr_schedule(1.0) == 0.7
 
@@ -251,186 +199,3 @@ def test_a_normalized_environment_is_found_again(tmp_path: Path) -> None:
     assert loaded.get_vec_normalize_env() is restored
     np.testing.assert_array_equal(restored.obs_rms.mean, env.obs_rms.mean)
     train_once(loaded)
-
-
-# Parameters
-
-
-def test_parameters_go_from_one_model_to_another(model: TRPOGAE) -> None:
-    other = fresh_model()
-    assert differing(state_of(other.policy), state_of(model.policy)) != []
-    other.set_parameters(model.get_parameters())
-    check_same(other, model)
-
-
-def test_parameters_go_from_a_file_to_a_model(model: TRPOGAE, file: bytes, tmp_path: Path) -> None:
-    (tmp_path / "model.zip").write_bytes(file)
-    for source in (tmp_path / "model.zip", str(tmp_path / "model"), io.BytesIO(file)):
-        other = fresh_model()
-        other.set_parameters(source)  # type: ignore[arg-type]
-        check_same(other, model)
-
-
-def test_some_parameters_can_be_replaced() -> None:
-    other = trained_model()
-    assert other.policy.value_net.scale != 1.0
-    before = state_of(other.policy)
-    other.set_parameters({"policy": {"action_net.bias": th.ones(2)}}, exact_match=False)
-    assert differing(before, state_of(other.policy)) == ["action_net.bias"]
-
-
-@pytest.mark.parametrize("policy", ["MlpPolicy", ActorCriticPolicy])
-@pytest.mark.parametrize("through_a_file", [False, True])
-def test_weights_of_contribs_trpo_are_taken_over(through_a_file: bool, policy: Any) -> None:
-    theirs = sb3_contrib.TRPO("MlpPolicy", vec_env(), n_steps=16, batch_size=32, policy_kwargs=SMALL, seed=3)
-    theirs.learn(32)
-    ours = TRPOGAE(policy, vec_env(), n_steps=16, policy_kwargs=SMALL, seed=0)
-    train_once(ours)
-    ours.set_parameters(io.BytesIO(saved(theirs)) if through_a_file else theirs.get_parameters())  # type: ignore[arg-type]
-    for mine, expected in zip(values_and_actions(ours), values_and_actions(theirs), strict=True):
-        np.testing.assert_array_equal(mine, expected)
-    values = []
-    probe = KLProbe()
-    probe._on_rollout_end = lambda: values.append(values_and_actions(ours)[0])  # type: ignore[method-assign]
-    train_once(ours, probe)
-    np.testing.assert_array_equal(values[0], values_and_actions(theirs)[0], "the first rollout leaves the values as they were")
-
-
-def mismatches() -> dict[str, dict[str, Any]]:
-    good = fresh_model(seed=9, vf_optimizer="adam").get_parameters()
-    policy, optimizer = good["policy"], good["policy.optimizer"]
-    one_group_more = {"state": {}, "param_groups": optimizer["param_groups"] * 2}
-    return {
-        "a tensor is missing": good | {"policy": {name: policy[name] for name in policy if name != "value_net.bias"}},
-        "a tensor too many": good | {"policy": policy | {"other": th.zeros(1)}},
-        "the last tensor is of another shape": good | {"policy": policy | {"value_net.bias": th.zeros(3)}},
-        "an object is missing": {"policy": policy},
-        "an object too many": good | {"nobody": policy},
-        "another optimiser": good | {"policy.optimizer": one_group_more},
-        "numbers instead of tensors": good | {"policy": dict.fromkeys(policy, 0.0)},
-    }
-
-
-@pytest.mark.parametrize("what", mismatches())
-def test_parameters_that_do_not_fit_change_nothing(what: str) -> None:
-    model = trained_model(vf_optimizer="adam")
-    before, optimizer = state_of(model.policy), optimizer_state(model)
-    with pytest.raises((ValueError, RuntimeError, TypeError, AttributeError)):
-        model.set_parameters(mismatches()[what])
-    assert differing(before, state_of(model.policy)) == []
-    assert len(optimizer) > 8 and differing(optimizer, optimizer_state(model)) == []
-
-
-# Damaged and foreign files
-
-
-def check_refused(damaged: bytes, model: TRPOGAE, tmp_path: Path) -> None:
-    """By both ways of reading, from memory and from a path, and the model in memory does not notice."""
-    before = state_of(model.policy)
-    (tmp_path / "damaged.zip").write_bytes(damaged)
-    for source in (io.BytesIO(damaged), tmp_path / "damaged.zip", str(tmp_path / "damaged.zip")):
-        with pytest.raises(ValueError, match=r"damaged, or is not a model"):
-            TRPOGAE.load(source)
-        with pytest.raises(ValueError, match=r"damaged, or is not a model"):
-            model.set_parameters(source)  # type: ignore[arg-type]
-        assert differing(before, state_of(model.policy)) == []
-
-
-@pytest.mark.parametrize("tenths", range(10))
-def test_a_truncated_file_is_refused(tenths: int, file: bytes, tmp_path: Path) -> None:
-    check_refused(file[: len(file) * tenths // 10], fresh_model(), tmp_path)
-
-
-def test_a_file_that_lacks_its_last_byte_is_refused(file: bytes, tmp_path: Path) -> None:
-    check_refused(file[:-1], fresh_model(), tmp_path)
-
-
-@pytest.mark.parametrize("member", ["data", "policy.pth", "policy.optimizer.pth", "pytorch_variables.pth", "system_info.txt"])
-@pytest.mark.parametrize("part", [0.0, 0.25, 0.5, 0.75, 1.0])
-def test_a_flipped_byte_in_any_member_is_refused(part: float, member: str, file: bytes, tmp_path: Path) -> None:
-    info = zipfile.ZipFile(io.BytesIO(file)).getinfo(member)
-    start = info.header_offset + 30 + int.from_bytes(file[info.header_offset + 26 : info.header_offset + 28], "little")
-    start += int.from_bytes(file[info.header_offset + 28 : info.header_offset + 30], "little")
-    check_refused(flipped(file, start + int(part * (info.compress_size - 1))), fresh_model(), tmp_path)
-
-
-def test_a_flipped_weight_is_refused(file: bytes, model: TRPOGAE, tmp_path: Path) -> None:
-    """Also where only the numbers change and the file reads well in every other respect."""
-    weights = model.policy.action_net.weight.detach().numpy().tobytes()
-    assert file.count(weights) == 1
-    check_refused(flipped(file, file.index(weights) + 5), fresh_model(), tmp_path)
-
-
-def flipped(content: bytes, position: int) -> bytes:
-    return content[:position] + bytes([content[position] ^ 0xFF]) + content[position + 1 :]
-
-
-def test_a_flipped_byte_anywhere_is_refused_or_changes_nothing(file: bytes, model: TRPOGAE) -> None:
-    """Some bytes of an archive mean nothing to a reader, such as dates."""
-    refused = 0
-    for position in np.linspace(0, len(file) - 1, 60, dtype=int):
-        try:
-            loaded = TRPOGAE.load(io.BytesIO(flipped(file, position)))
-        except ValueError:
-            refused += 1
-        else:
-            check_same(loaded, model)
-    assert refused > 50
-
-
-@pytest.mark.parametrize("content", [b"", b"PK", b"not a zip at all" * 100], ids=["empty", "two bytes", "text"])
-def test_a_file_of_another_kind_is_refused(content: bytes, tmp_path: Path) -> None:
-    check_refused(content, fresh_model(), tmp_path)
-
-
-def test_an_archive_of_another_kind_is_refused(tmp_path: Path) -> None:
-    memory = io.BytesIO()
-    with zipfile.ZipFile(memory, "w") as archive:
-        archive.writestr("readme.txt", "nothing to learn here")
-    check_refused(memory.getvalue(), fresh_model(), tmp_path)
-
-
-@pytest.mark.parametrize("data", ["[1, 2]", '[{"vf_trust_region": 1}]', "5", "no JSON"])
-def test_an_archive_that_looks_like_a_model_is_refused(data: str, file: bytes, tmp_path: Path) -> None:
-    memory = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(file)) as good, zipfile.ZipFile(memory, "w") as archive:
-        for member in good.namelist():
-            archive.writestr(member, data if member == "data" else good.read(member))
-    check_refused(memory.getvalue(), fresh_model(), tmp_path)
-
-
-@pytest.mark.parametrize("missing", ["data", "policy.pth", "policy.optimizer.pth"])
-def test_an_archive_that_lacks_a_member_is_refused(missing: str, file: bytes, tmp_path: Path) -> None:
-    memory = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(file)) as good, zipfile.ZipFile(memory, "w") as archive:
-        for member in good.namelist():
-            if member != missing:
-                archive.writestr(member, good.read(member))
-    check_refused(memory.getvalue(), fresh_model(), tmp_path)
-
-
-@pytest.mark.parametrize("algorithm", [PPO, sb3_contrib.TRPO])
-def test_a_model_of_another_algorithm_is_refused_and_the_message_says_what_to_do(algorithm: Any, tmp_path: Path) -> None:
-    other = algorithm("MlpPolicy", vec_env(), n_steps=16, batch_size=32, policy_kwargs=SMALL)
-    other.save(tmp_path / "other.zip")
-    with pytest.raises(ValueError, match=r"other\.zip was saved by another algorithm than TRPOGAE.*set_parameters"):
-        TRPOGAE.load(tmp_path / "other.zip")
-    fresh_model().set_parameters(tmp_path / "other.zip")  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize("kind", [str, Path])
-def test_a_missing_file_is_a_file_not_found_error(kind: type, tmp_path: Path) -> None:
-    missing = kind(tmp_path / "nothing")
-    with pytest.raises(FileNotFoundError):
-        TRPOGAE.load(missing)
-    model = fresh_model()
-    before = state_of(model.policy)
-    with pytest.raises(FileNotFoundError):
-        model.set_parameters(missing)  # type: ignore[arg-type]
-    assert differing(before, state_of(model.policy)) == []
-
-
-def test_foreign_arguments_are_not_kept() -> None:
-    with pytest.warns(UserWarning):
-        model = fresh_model(n_epochs=3)
-    assert "n_epochs" in FOREIGN_ARGUMENTS and not hasattr(model, "n_epochs")

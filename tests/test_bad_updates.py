@@ -1,0 +1,121 @@
+"""Bad numbers in an update are refused with words that say which, and what has moved is moved back."""
+
+import dataclasses
+import math
+from typing import Any
+
+import pytest
+import torch as th
+from bad_numbers import BAD, check_refused
+from envs_for_tests import differing, optimizer_state, short_model, state_of, train_once
+
+import sb3_gae.update.policy_step
+import sb3_gae.update.value_step
+from sb3_gae import MlpPolicy
+
+
+def spoil(monkeypatch: pytest.MonkeyPatch, step: Any, **changes: Any) -> None:
+    """Let the problem of a step arrive at its solver with something changed."""
+    real = step.trust_region_step
+
+    def spoilt(problem: Any, settings: Any) -> Any:
+        changed = {name: change(getattr(problem, name)) for name, change in changes.items()}
+        return real(dataclasses.replace(problem, **changed), settings)
+
+    monkeypatch.setattr(step, "trust_region_step", spoilt)
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_a_bad_gradient_of_the_policy_is_refused(bad: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = short_model()
+    train_once(model)
+    spoil(monkeypatch, sb3_gae.update.policy_step, gradient=lambda gradient: gradient.index_fill(0, th.tensor([3]), bad))
+    check_refused(model, "gradient of the policy contains NaN or infinity")
+
+
+def test_a_bad_curvature_of_the_policy_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = short_model()
+    train_once(model)
+    spoil(monkeypatch, sb3_gae.update.policy_step, curvature=lambda product: lambda vector: product(vector) * math.nan)
+    check_refused(model, "curvature product of the policy contains NaN or infinity")
+
+
+@pytest.mark.parametrize("what", ["gradient", "curvature product"])
+def test_a_bad_value_step_is_refused_and_undoes_the_policy_step_before_it(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = short_model()
+    train_once(model)
+    if what == "gradient":
+        spoil(monkeypatch, sb3_gae.update.value_step, gradient=lambda gradient: gradient * math.inf)
+    else:
+        spoil(monkeypatch, sb3_gae.update.value_step, curvature=lambda product: lambda vector: product(vector) * math.nan)
+    check_refused(model, f"{what} of the value function contains NaN or infinity")
+
+
+def test_a_bad_gradient_of_adam_is_refused_and_undoes_the_policy_step_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = short_model(vf_optimizer="adam", batch_size=4)
+    train_once(model)
+    optimizer = optimizer_state(model)
+    losses = []
+
+    def third_is_bad(*args: Any, **kwargs: Any) -> th.Tensor:
+        losses.append(real(*args, **kwargs))
+        return losses[-1] * (math.nan if len(losses) == 3 else 1.0)
+
+    real = th.nn.functional.mse_loss
+    monkeypatch.setattr(th.nn.functional, "mse_loss", third_is_bad)
+    check_refused(model, "gradient of the value function contains NaN or infinity")
+    assert len(losses) == 3
+    assert differing(optimizer, optimizer_state(model)) == []
+
+
+@pytest.mark.parametrize("vf_optimizer", ["trust_region", "adam"])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
+def test_an_update_that_is_interrupted_is_undone(error: type[BaseException], vf_optimizer: str) -> None:
+    model = short_model(vf_optimizer=vf_optimizer)
+    train_once(model)
+    fit_value, before, optimizer = model._fit_value, state_of(model.policy), optimizer_state(model)
+    moved = []
+
+    def interrupted(*args: Any) -> None:
+        fit_value(*args)
+        moved.extend(differing(before, state_of(model.policy)))
+        raise error
+
+    model._fit_value = interrupted  # type: ignore[method-assign, assignment]
+    with pytest.raises(error):
+        train_once(model)
+    assert {"action_net.weight", "value_net.weight"} <= set(moved)
+    assert differing(before, state_of(model.policy)) == []
+    assert differing(optimizer, optimizer_state(model)) == []
+    model._fit_value = fit_value  # type: ignore[method-assign]
+    assert train_once(model)["train/n_updates"] == 2
+
+
+@pytest.mark.parametrize("error", [th.linalg.LinAlgError, ZeroDivisionError, OverflowError])
+def test_linear_algebra_that_breaks_down_is_a_numerical_error(error: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
+    def breaks_down(vector: th.Tensor) -> th.Tensor:
+        raise error("no such decomposition")
+
+    model = short_model()
+    train_once(model)
+    spoil(monkeypatch, sb3_gae.update.policy_step, curvature=lambda product: breaks_down)
+    check_refused(model, "linear algebra of the update broke down: no such decomposition")
+
+
+def test_a_trial_that_torch_refuses_is_a_trial_that_failed() -> None:
+    """With such a radius the first steps make standard deviations of 0. Shorter ones follow, and no error."""
+    refusals = []
+
+    class Watched(MlpPolicy):
+        def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Any:
+            try:
+                return super()._get_action_dist_from_latent(latent_pi)
+            except ValueError:
+                refusals.append(True)
+                raise
+
+    search = {"line_search_shrinking_factor": 0.5, "line_search_max_iter": 60}
+    model = short_model(policy=Watched, target_kl=1e6, **search)
+    logged = train_once(model)
+    assert len(refusals) > 0
+    assert logged["train/is_line_search_success"] == 1.0 and logged["train/line_search_trials"] > len(refusals)
