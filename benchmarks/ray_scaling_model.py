@@ -17,7 +17,7 @@ import argparse
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import median
+from statistics import linear_regression, median
 from typing import NamedTuple
 
 RESULTS = Path(__file__).parent / "results" / "ray_speed.csv"
@@ -28,11 +28,12 @@ BATCH = 200_000
 class Costs(NamedTuple):
     """
     :param worker_seconds: that one worker takes for a step of one environment: physics, policy, and handing it over
-    :param learner_seconds: that the learner takes for a step, to put it into its buffer and to show it to callbacks
+    :param learner_seconds: that the learner takes for a step, to take it in, put it into its buffer and show it to callbacks
     :param update_seconds: of values, advantages and update of a whole batch
     :param weights_bytes: that each machine gets
     :param step_bytes: that a step brings back
-    :param worker_overhead: seconds of the learner for each worker: messages and where its environments stand
+    :param worker_overhead: seconds of an iteration for each worker, however few its steps are. An upper bound, since it is
+        measured where workers share the cores of one machine
     """
 
     worker_seconds: float
@@ -109,12 +110,13 @@ def costs_from(rows: Sequence[dict[str, str]], task: str) -> Costs:
     """
     :param rows: of ``ray_speed.csv``
     :param task: id
-    :return: medians over the rounds with the fewest workers
+    :return: medians over the rounds with the fewest workers; what a worker adds from batches of a few steps
     :raises ValueError: if there are no rows of workers for the task
     """
     of_workers = [row for row in rows if row["task"] == task and row["way"] == "ray workers"]
     if not of_workers:
         raise ValueError(f"There are no rows of {task} with workers; run benchmarks/ray_speed.py first.")
+    overhead = seconds_of_a_worker([row for row in rows if row["way"] == "messages"])
     fewest = min(int(row["workers"]) for row in of_workers)
     chosen = [row for row in of_workers if int(row["workers"]) == fewest]
 
@@ -126,12 +128,27 @@ def costs_from(rows: Sequence[dict[str, str]], task: str) -> Costs:
     replay = median(float(row["rollout_s"]) - float(row["collection_s"]) for row in chosen)
     return Costs(
         worker_seconds=typical("worker_s") * fewest / batch,
-        learner_seconds=replay / batch,
+        learner_seconds=(replay + max(0.0, on_the_way - fewest * overhead)) / batch,
         update_seconds=typical("update_s"),
         weights_bytes=typical("weights_bytes"),
         step_bytes=typical("shares_bytes", "states_bytes") / batch,
-        worker_overhead=on_the_way / fewest,
+        worker_overhead=overhead,
     )
+
+
+def seconds_of_a_worker(rows: Sequence[dict[str, str]]) -> float:
+    """
+    :param rows: of ``ray_speed.csv``, of batches of a few steps with several numbers of workers
+    :return: slope of the straight line through the medians of what they took to collect
+    :raises ValueError: if there are not at least two numbers of workers
+    """
+    seconds: dict[int, list[float]] = {}
+    for row in rows:
+        seconds.setdefault(int(row["workers"]), []).append(float(row["collection_s"]))
+    if len(seconds) < 2:
+        raise ValueError("There are no rows of messages; run benchmarks/ray_speed.py first.")
+    medians = {workers: median(times) for workers, times in seconds.items()}
+    return linear_regression(list(medians), list(medians.values())).slope
 
 
 def table(iterations: Sequence[Iteration], batch: int) -> str:

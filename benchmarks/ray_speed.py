@@ -2,8 +2,9 @@
 How fast whole iterations are with Ray workers, beside one process, SubprocVecEnv, and sb3-contrib's TRPO.
 
     python benchmarks/ray_speed.py                              # writes benchmarks/results/ray_speed.csv
-    python benchmarks/ray_speed.py --tasks BipedalWalker-v3 --rounds 3
+    python benchmarks/ray_speed.py --tasks BipedalWalker-v3 --rounds 5
     python benchmarks/ray_speed.py --address 10.0.0.1:6379      # workers of a cluster, such as hosts in network namespaces
+    python benchmarks/ray_speed.py --messages                   # only what a further worker costs
     python benchmarks/ray_speed.py --smoke                      # tiny, to see that it runs; writes nothing
 
 BipedalWalker-v3 is a plain gymnasium environment that has no batched form; the quadruped and the biped have one. Networks
@@ -38,6 +39,9 @@ FIELDS = ("task", "way", "workers", "n_envs", "batch", "cores", "round", "rollou
 FIELDS += ("weights_bytes", "shares_bytes", "states_bytes")
 WORKERS = (1, 2)
 
+#: of these the smallest batches are timed, to tell what each further worker costs
+MESSAGES_TASK, MESSAGES_WORKERS, MESSAGES_STEPS = "GaeQuadruped-v0", (1, 2, 4, 8, 16), 8
+
 
 class Task(NamedTuple):
     """
@@ -45,12 +49,15 @@ class Task(NamedTuple):
     :param n_envs: of ours, in one process and on all workers together
     :param subproc_envs: of a SubprocVecEnv, each a process of its own; all are run, and the fastest counts
     :param batch: steps of an iteration
+    :param peer_batch: of the ways that send each step of each environment through a pipe, or step one after another: a step
+        takes as long in any batch, and a batch of 200 000 would take them minutes
     """
 
     env: str
     n_envs: int
     subproc_envs: tuple[int, ...]
     batch: int
+    peer_batch: int
 
 
 class Way(NamedTuple):
@@ -68,16 +75,17 @@ class Way(NamedTuple):
 
 
 TASKS = (
-    Task("BipedalWalker-v3", 16, (2, 8, 16), 20_000),
-    Task("GaeQuadruped-v0", 256, (2, 8, 16), 200_000),
-    Task("GaeBiped-v0", 256, (2, 8, 16), 50_000),
+    Task("BipedalWalker-v3", 16, (2, 8, 16), 20_000, 20_000),
+    Task("GaeQuadruped-v0", 256, (2, 16), 200_000, 10_000),
+    Task("GaeBiped-v0", 256, (2, 16), 50_000, 10_000),
 )
-SMOKE = (Task("BipedalWalker-v3", 2, (2,), 64), Task("GaeQuadruped-v0", 4, (2,), 64))
+SMOKE = (Task("BipedalWalker-v3", 2, (2,), 64, 64), Task("GaeQuadruped-v0", 4, (2,), 64, 64))
 
 
 def ways(task: Task, workers: Sequence[int]) -> Iterator[Way]:
     def learner(algorithm: Any, n_envs: int, **env_kwargs: Any) -> Callable[[], Learner]:
-        return lambda: make_learner(algorithm, task.env, n_envs, task.batch, **env_kwargs)
+        batched = env_kwargs["vec_env_cls"] not in (SubprocVecEnv, DummyVecEnv)
+        return lambda: make_learner(algorithm, task.env, n_envs, task.batch if batched else task.peer_batch, **env_kwargs)
 
     yield Way("one process", 0, task.n_envs, learner(TRPOGAE, task.n_envs, vec_env_cls=batched_vec_env))
     for k in workers:
@@ -97,6 +105,21 @@ def measure(task: Task, rounds: int, workers: Sequence[int]) -> Iterator[dict[st
         if number > 0:
             yield row(task, way, learner, number)
     for _, learner in running:
+        assert learner.model.env is not None
+        learner.model.env.close()
+
+
+def messages(counts: Sequence[int], rounds: int) -> Iterator[dict[str, Any]]:
+    """Batches of a few steps, with one environment on each worker."""
+    for k in counts:
+        task = Task(MESSAGES_TASK, k, (), k * MESSAGES_STEPS, 0)
+        env_kwargs = {"vec_env_cls": RayVecEnv, "vec_env_kwargs": {"n_workers": k}}
+        way = Way("messages", k, k, lambda: make_learner(TRPOGAE, task.env, k, task.batch, **env_kwargs))  # noqa: B023
+        learner = way.make()
+        for number in range(rounds + 1):
+            learner.iterate()
+            if number > 0:
+                yield row(task, way, learner, number)
         assert learner.model.env is not None
         learner.model.env.close()
 
@@ -141,10 +164,11 @@ def report(rows: Sequence[dict[str, Any]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", choices=[task.env for task in TASKS], default=[task.env for task in TASKS])
-    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--workers", type=int, nargs="+", default=WORKERS)
     parser.add_argument("--address", help="of a Ray cluster; else one is started on this machine")
     parser.add_argument("--out", type=Path, default=RESULTS)
+    parser.add_argument("--messages", action="store_true", help="only the smallest batches, in place of those of the file")
     parser.add_argument("--smoke", action="store_true", help="tiny, and nothing is written")
     args = parser.parse_args()
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -152,20 +176,35 @@ def main() -> None:
         os.environ["RAY_ADDRESS"] = args.address
     else:
         # A place for the workers of all ways, which are there at once and at work in turn
-        ray.init(num_cpus=sum(args.workers), include_dashboard=False)
+        ray.init(num_cpus=max(sum(args.workers), *MESSAGES_WORKERS), include_dashboard=False)
     warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
     print(f"Python {sys.version.split()[0]}, torch {th.__version__}, {th.get_num_threads()} threads")
     rows: list[dict[str, Any]] = []
-    for task in SMOKE if args.smoke else [task for task in TASKS if task.env in args.tasks]:
+    tasks: Sequence[Task] = SMOKE if args.smoke else [task for task in TASKS if task.env in args.tasks]
+    if args.messages:
+        tasks = ()
+        with args.out.open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if row["way"] != "messages"]
+    for task in tasks:
         of_task = list(measure(task, 1 if args.smoke else args.rounds, args.workers))
         report(of_task)
         rows.extend(of_task)
+        if not args.smoke:
+            write(rows, args.out)
+    rows.extend(of_messages := list(messages((1, 2) if args.smoke else MESSAGES_WORKERS, 2 if args.smoke else 20)))
+    print("\nbatches of 8 steps a worker:")
+    for k, group in itertools.groupby(of_messages, lambda row: row["workers"]):
+        print(f"  {k:3d} workers {median(float(row['collection_s']) for row in group) * 1000:.1f} ms")
     if not args.smoke:
-        args.out.parent.mkdir(exist_ok=True)
-        with args.out.open("w", newline="") as file:
-            writer = csv.DictWriter(file, FIELDS)
-            writer.writeheader()
-            writer.writerows(rows)
+        write(rows, args.out)
+
+
+def write(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    path.parent.mkdir(exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, FIELDS)
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 if __name__ == "__main__":

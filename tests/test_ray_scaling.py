@@ -54,10 +54,16 @@ def rows(
     }
 
 
+MESSAGES = [rows(0.0, seconds, workers=k, way="messages") for k, seconds in ((1, 0.05), (1, 0.01), (1, 0.02), (3, 0.04))]
+
+
 def test_costs_are_medians_of_the_rows_with_the_fewest_workers() -> None:
     measured = [rows(2.0, 2.2), rows(4.0, 4.3), rows(3.0, 3.1), rows(1.0, 9.0, workers=2), rows(9.0, 9.0, task="other")]
-    costs = costs_from(measured, "task")
-    assert costs == pytest.approx(Costs(3e-3, 5e-4, 3.0, 4000.0, 100.0, 0.2))
+    costs = costs_from(measured + MESSAGES, "task")
+    # A worker adds 0.01 s; of the 0.2 s between the worker's time and the whole, 0.19 are of the batch
+    assert costs == pytest.approx(Costs(3e-3, 6.9e-4, 3.0, 4000.0, 100.0, 0.01))
+    with pytest.raises(ValueError, match="no rows of messages"):
+        costs_from(measured, "task")
     with pytest.raises(ValueError, match=r"no rows of another with workers; run benchmarks/ray_speed\.py first"):
         costs_from(measured, "another")
 

@@ -45,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     plan.add_argument("--preset", nargs="+", choices=list(PRESETS), default=list(DEFAULT_PRESETS), help="(%(default)s)")
     plan.add_argument("--tasks", nargs="+", help="only these")
     plan.add_argument("--algorithms", nargs="+", help="only these")
+    plan.add_argument("--variants", nargs="+", help="only these, of the ablation or of tuning")
     plan.add_argument("--seeds", nargs="+", type=int, help="only these")
     plan.add_argument("--jobs", type=int, default=1, help="runs side by side, each on a core of its own (%(default)s)")
 
@@ -72,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _chosen(args: argparse.Namespace) -> list[Cell]:
-    wanted = {"task": args.tasks, "algorithm": args.algorithms, "seed": args.seeds}
+    wanted = {"task": args.tasks, "algorithm": args.algorithms, "variant": args.variants, "seed": args.seeds}
     cells = cells_of(args.preset)
     for name, values in wanted.items():
         if values is not None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from benchmarks.peers.algorithms import A2C, OURS, PPO, TIANSHOU_NPG, TIANSHOU_TRPO, TRPO
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, MUJOCO_TASKS, PUBLISHED_PPO
-from benchmarks.peers.variants import SHIPPED, VARIANTS
+from benchmarks.peers.variants import CANDIDATES, SHIPPED, VARIANTS
 
 #: of ours and of the peers that the targets name
 SEEDS = 5
@@ -16,6 +16,10 @@ FEW_SEEDS = 3
 CLASSIC_SEEDS = 10
 ABLATION_TASKS = ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
 SMOKE_STEPS = 2_000
+#: of tuning, none of them among those that are reported
+TUNING_SEEDS = (100, 101, 102)
+TUNING_TASKS = ("Walker2d-v5", "Hopper-v5", "HalfCheetah-v5")
+TUNING_STEPS = 500_000
 
 
 class Cell(NamedTuple):
@@ -24,7 +28,7 @@ class Cell(NamedTuple):
 
     :param task: id of the environment
     :param algorithm: a key of :data:`~benchmarks.peers.algorithms.ALGORITHMS`
-    :param variant: a key of :data:`~benchmarks.peers.variants.VARIANTS`; only ours has others than the first
+    :param variant: a key of :data:`~benchmarks.peers.variants.VARIANTS` or ``CANDIDATES``; only ours has others than the first
     :param seed: of the training
     :param steps: of the training
     """
@@ -81,6 +85,13 @@ def _ablation() -> Iterator[Cell]:
                 yield Cell(task, OURS, variant, seed, MUJOCO_STEPS)
 
 
+def _tuning() -> Iterator[Cell]:
+    for seed in TUNING_SEEDS:
+        for variant in CANDIDATES:
+            for task in TUNING_TASKS:
+                yield Cell(task, OURS, variant, seed, TUNING_STEPS)
+
+
 def _mujoco() -> Iterator[Cell]:
     tasks = dict.fromkeys(MUJOCO_TASKS, MUJOCO_STEPS)
     first = {OURS: SEEDS, TRPO: SEEDS, PPO: SEEDS}
@@ -93,5 +104,6 @@ PRESETS: dict[str, tuple[Cell, ...]] = {
     "mujoco": tuple(_mujoco()),
     "mujoco-3m": tuple(_seed_major(dict.fromkeys(PUBLISHED_PPO, LONG_STEPS), {OURS: SEEDS})),
     "ablation": tuple(_ablation()),
+    "tuning": tuple(_tuning()),
     "smoke": tuple(_seed_major({"CartPole-v1": SMOKE_STEPS}, {OURS: 1, TRPO: 1})),
 }

@@ -18,9 +18,9 @@ from benchmarks.peers.comparison import (
 )
 from benchmarks.peers.curves import Run, all_runs, runs_of, scores_of
 from benchmarks.peers.page import markdown_table
-from benchmarks.peers.plan import ABLATION_TASKS
+from benchmarks.peers.plan import ABLATION_TASKS, TUNING_STEPS, TUNING_TASKS
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, PUBLISHED_PPO
-from benchmarks.peers.variants import VARIANTS
+from benchmarks.peers.variants import CANDIDATES, VARIANTS
 from sb3_gae.sweep.statistics import interquartile_mean
 
 #: parts of sb3-contrib TRPO's training time at which scores are compared
@@ -142,6 +142,19 @@ def ablation_table(table: pd.DataFrame) -> str:
         if any(own.values()) and all(shipped.values()):
             rows.append([about.title, *(_score(runs) for runs in own.values()), _against(own, shipped)])
     return markdown_table(["", *ABLATION_TASKS, "IQM over tasks, as shipped = 1"], rows if len(rows) > 1 else [])
+
+
+def tuning_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: score of each run with settings that were tried, by the seeds for tuning
+    """
+    rows = []
+    for variant, about in CANDIDATES.items():
+        own = [runs_of(table, task, OURS, TUNING_STEPS, variant) for task in TUNING_TASKS]
+        if any(own):
+            rows.append([about.title, *(", ".join(number(run.score) for run in runs) for runs in own)])
+    return markdown_table(["", *TUNING_TASKS], rows)
 
 
 def _against(own: dict[str, list[Run]], shipped: dict[str, list[Run]]) -> str:

@@ -1,4 +1,4 @@
-"""Our settings with one choice undone, for the ablation."""
+"""Our settings with one choice changed: undone, for the ablation, or tried, before they were chosen."""
 
 from typing import Any, NamedTuple
 
@@ -30,4 +30,35 @@ VARIANTS = {
     "large-batch": Variant("batches of 8 192 steps, not 2 048", {"n_steps": 1024}),
     "low-lambda": Variant("λ = 0.9, not 0.95", {"gae_lambda": 0.9}),
     "high-lambda": Variant("λ = 1, not 0.95", {"gae_lambda": 1.0}),
+}
+
+# All that was varied, so that what is shipped later does not change what was tried
+_BEFORE_TUNING = {
+    "n_envs": 8,
+    "n_steps": 256,
+    "gae_lambda": 0.95,
+    "target_kl": 0.01,
+    "policy_kwargs": "dict(log_std_init=-1)",
+    "vf_steps": 5,
+    "vf_trust_region": 0.2,
+}
+
+#: settings that were tried on the seeds for tuning
+CANDIDATES = {
+    f"try-{name}": Variant(title, _BEFORE_TUNING | overrides)
+    for name, title, overrides in (
+        ("first", "as before tuning: KL 0.01, five value steps at ε = 0.2, std e⁻¹, 8 × 256 steps", {}),
+        ("gymnasium", "stepped by gymnasium, not by EnvPool", {"batched_envs": False}),
+        ("std-1", "initial std 1", {"policy_kwargs": "dict(log_std_init=0)"}),
+        ("kl-.02", "KL 0.02", {"target_kl": 0.02}),
+        ("two-value-steps", "two value steps at ε = 0.05", {"vf_steps": 2, "vf_trust_region": 0.05}),
+        ("full-cg", "conjugate gradient without a tolerance", {"cg_tolerance": 0.0}),
+        ("two-envs", "2 environments × 1 024 steps", {"n_envs": 2, "n_steps": 1024}),
+        ("envs-32", "32 environments × 64 steps", {"n_envs": 32, "n_steps": 64}),
+        ("small-batch", "batches of 1 024 steps", {"n_steps": 128}),
+        ("wide", "networks of 256-256", {"policy_kwargs": "dict(log_std_init=-1, net_arch=[256, 256])"}),
+        ("monte-carlo", "Monte-Carlo targets", {"value_lambda": 1.0}),
+        ("lambda-.98", "λ = 0.98", {"gae_lambda": 0.98}),
+        ("lambda-auto", 'gae_lambda="auto"', {"gae_lambda": "auto"}),
+    )
 }
