@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
-from ray_scaling_model import WORKERS, Costs, costs_from, first_at_limit, predict, table  # isort: skip
+from ray_scaling_model import WORKERS, Costs, costs_from, first_at_limit, main, predict, table  # isort: skip
 
 COSTS = Costs(
     worker_seconds=1e-3,
@@ -73,3 +73,12 @@ def test_the_table_has_a_line_for_each_number_of_workers() -> None:
     assert len(lines) == 2 + len(WORKERS)
     assert lines[2].startswith("| 1 | 200.00 |") and lines[2].endswith("| 1.00 | workers |")
     assert lines[-1].startswith("| 256 |") and lines[-1].endswith("| learner |")
+
+
+def test_the_page_has_the_table_of_the_committed_costs(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["ray_scaling_model.py"])
+    main()
+    printed = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    assert "\n".join(printed) in (Path(__file__).parent.parent / "docs" / "scaling.md").read_text()

@@ -18,7 +18,7 @@ ABLATION_TASKS = ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5")
 SMOKE_STEPS = 2_000
 #: of tuning, none of them among those that are reported
 TUNING_SEEDS = (100, 101, 102)
-TUNING_TASKS = ("Walker2d-v5", "Hopper-v5", "HalfCheetah-v5")
+TUNING_TASKS = ("Walker2d-v5", "Hopper-v5", "HalfCheetah-v5", "Ant-v5", "Swimmer-v5", "Humanoid-v5")
 TUNING_STEPS = 500_000
 
 
