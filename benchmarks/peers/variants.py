@@ -53,6 +53,7 @@ CANDIDATES = {
         ("gymnasium", "… stepped by gymnasium, not by EnvPool", {"batched_envs": False}),
         ("kl-.02", "… KL 0.02", {"target_kl": 0.02}),
         ("envs-32", "… 32 environments × 64 steps", {"n_envs": 32, "n_steps": 64}),
+        ("two-envs", "… 2 environments × 1 024 steps", {"n_envs": 2, "n_steps": 1024}),
         ("small-batch", "… batches of 1 024 steps", {"n_steps": 128}),
         ("std-1", "initial std 1", _STD_1),
         ("std-.6", "initial std e^-½", {"policy_kwargs": "dict(log_std_init=-0.5)"}),
@@ -67,6 +68,12 @@ CANDIDATES = {
             _STD_1 | {"target_kl": 0.05, "n_envs": 32, "n_steps": 64},
         ),
         ("std-1-envs-32", "initial std 1, 32 environments × 64 steps", _STD_1 | {"n_envs": 32, "n_steps": 64}),
+        ("std-1-two-envs", "initial std 1, 2 × 1 024 steps", _STD_1 | {"n_envs": 2, "n_steps": 1024}),
+        (
+            "std-1-two-envs-monte-carlo",
+            "initial std 1, 2 × 1 024 steps, Monte-Carlo targets",
+            _STD_1 | {"n_envs": 2, "n_steps": 1024, "value_lambda": 1.0},
+        ),
         ("std-1-small-batch", "initial std 1, batches of 1 024 steps", _STD_1 | {"n_steps": 128}),
         ("std-1-large-batch", "initial std 1, batches of 4 096 steps", _STD_1 | {"n_steps": 512}),
         (
