@@ -57,6 +57,8 @@ CANDIDATES = {
         ("small-batch", "… batches of 1 024 steps", {"n_steps": 128}),
         ("std-1", "initial std 1", _STD_1),
         ("std-.6", "initial std e^-½", {"policy_kwargs": "dict(log_std_init=-0.5)"}),
+        ("kl-.03", "… KL 0.03", {"target_kl": 0.03}),
+        ("kl-.03-envs-32", "… KL 0.03, 32 × 64 steps", {"target_kl": 0.03, "n_envs": 32, "n_steps": 64}),
         ("kl-.05", "… KL 0.05", {"target_kl": 0.05}),
         ("std-.6-kl-.05", "initial std e^-½, KL 0.05", {"policy_kwargs": "dict(log_std_init=-0.5)", "target_kl": 0.05}),
         ("std-1-kl-.02", "initial std 1, KL 0.02", _STD_1 | {"target_kl": 0.02}),
