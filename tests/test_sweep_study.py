@@ -12,14 +12,16 @@ from pathlib import Path
 
 import optuna
 import pytest
+from optuna.exceptions import StorageInternalError
 from optuna.trial import TrialState
+from sqlalchemy.exc import PendingRollbackError, SQLAlchemyError
 
 from sb3_gae.sweep import Cell, SweepError, SweepStudy
 from sb3_gae.sweep.errors import UnreachableError
 from sb3_gae.sweep.ledger import MAX_LOST, Outcome, Status
 from sb3_gae.sweep.liveness import sign_of_life, why_dead
 from sb3_gae.sweep.patience import Patience
-from sb3_gae.sweep.storage import holds
+from sb3_gae.sweep.storage import holds, storage_errors
 from sb3_gae.sweep.study import TakenOverError
 
 CELLS = [Cell("CartPole-v1", "trust_region", 0.9, value, 0, 3) for value in (0.0, 0.5, 1.0)]
@@ -357,3 +359,11 @@ def test_what_is_not_there_is_not_made(tmp_path: Path) -> None:
         SweepStudy("other", str(tmp_path / "sweep.journal"), create=False)
     with pytest.raises(SweepError, match="without slashes"):
         SweepStudy(f"a{os.sep}b")
+
+
+def test_asking_again_in_a_transaction_that_an_outage_ended_is_an_outage() -> None:
+    with pytest.raises(UnreachableError, match="cannot be reached: Can't reconnect"), storage_errors("postgresql://host/base"):
+        try:
+            raise PendingRollbackError("Can't reconnect until invalid transaction is rolled back.")
+        except SQLAlchemyError as error:
+            raise StorageInternalError("An exception is raised during the commit.") from error

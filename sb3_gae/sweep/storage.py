@@ -17,6 +17,7 @@ from sqlalchemy.exc import (
     InterfaceError,
     NoSuchModuleError,
     OperationalError,
+    PendingRollbackError,
     ProgrammingError,
     SQLAlchemyError,
 )
@@ -220,13 +221,14 @@ def storage_errors(location: str) -> Iterator[None]:
 
 
 def _is_outage(error: Exception) -> bool:
-    return isinstance(_cause_of(error), OperationalError | InterfaceError)
+    # The last one comes where Optuna asks again in the transaction that the outage has ended
+    return isinstance(_cause_of(error), OperationalError | InterfaceError | PendingRollbackError)
 
 
 def _cause_of(error: BaseException) -> BaseException:
     """What the database said, which Optuna wraps in a guess of its own."""
     inner: BaseException | None = error
-    while inner is not None and not isinstance(inner, DBAPIError):
+    while inner is not None and not isinstance(inner, DBAPIError | PendingRollbackError):
         inner = inner.__cause__
     return error if inner is None else inner
 
