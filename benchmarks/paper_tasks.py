@@ -6,7 +6,7 @@ What the shipped settings reach on the paper's tasks: rl-zoo3's own command over
     python benchmarks/paper_tasks.py --tasks GaeBiped-v0 --seeds 1000 --steps 50000000   # the paper's 1 000 iterations
     python benchmarks/paper_tasks.py --report                 # runs nothing: the table, and the figure in docs/images
 
-Each run is ``python -m rl_zoo3.train --algo trpo_gae --env TASK --seed SEED`` with nothing else set, then the last
+Each run is ``python -m rl_zoo3.train --algo trpo_gae --env TASK --seed SEED`` with one thread of torch, then the last
 agent (not the best) plays 20 episodes, deterministically, in the gymnasium environment. A row and a curve are stored
 as each run ends; what is stored is not run again. ``--steps`` trains for other than the shipped number of steps; the
 figure has the seeds that are run by default.

@@ -143,6 +143,14 @@ def test_response_and_lagged_gradients_are_means_over_all_trajectories(seed: int
 
 
 @given(seeds, factors)
+def test_responses_add_up_to_the_advantages(seed: int, gamma: float) -> None:
+    policy, n_lags = random_policy(layered_mdp(seed), seed), 4
+    total = np.tensordot(gamma ** np.arange(n_lags), response_function(policy, n_lags), axes=1)
+    ongoing = ~policy.mdp.terminal
+    np.testing.assert_allclose(total[ongoing], policy.advantages(gamma)[ongoing], atol=1e-12)
+
+
+@given(seeds, factors)
 def test_lambda_one_is_unbiased_for_any_values(seed: int, gamma: float) -> None:
     policy = random_policy(cyclic_mdp(seed), seed)
     gradient = policy.expected_gradient(random_values(policy, seed), gamma, 1.0)
