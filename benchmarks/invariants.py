@@ -12,7 +12,7 @@ import torch as th
 import sb3_gae.update.policy_step
 import sb3_gae.update.value_step
 from sb3_gae import TRPOGAE
-from sb3_gae.rollout.collection import training_batch
+from sb3_gae.rollout.evaluation import training_batch
 from sb3_gae.update.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
 
 # Divergences are measured here in double precision, and in the update in single

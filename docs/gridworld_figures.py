@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_gae.callbacks import PAPER_LAMBDAS
 from sb3_gae.estimators.group_statistics import gradient_errors
 from sb3_gae.gridworld import (
     TabularPolicy,
@@ -23,6 +22,7 @@ from sb3_gae.gridworld import (
     response_function,
     sample_episodes,
 )
+from sb3_gae.presets import PAPER_LAMBDAS
 
 IMAGES = Path(__file__).parent / "images"
 GAMMA = 0.95

@@ -8,8 +8,8 @@ import numpy as np
 from gridworld_figures import GAMMA, half_trained_policy, value_functions
 from measured_lambda import AVERAGED, CRITERIA, N_ROLLOUTS, exact, measured
 
-from sb3_gae.callbacks import PAPER_LAMBDAS
 from sb3_gae.gridworld import TabularPolicy
+from sb3_gae.presets import PAPER_LAMBDAS
 
 #: of 100 numbers of a gradient
 PROJECTIONS = (None, 16, 4)

@@ -9,10 +9,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from gridworld_figures import GAMMA, half_trained_policy, value_functions
 
-from sb3_gae.callbacks import PAPER_LAMBDAS
 from sb3_gae.diagnostics.rollout_diagnostics import expected_improvement
 from sb3_gae.estimators.group_statistics import gradient_errors
 from sb3_gae.gridworld import TabularPolicy, episode_advantages, episode_gradients, sample_episodes
+from sb3_gae.presets import PAPER_LAMBDAS
 
 N_GROUPS, N_ROLLOUTS, AVERAGED = 10, 200, 10
 

@@ -27,12 +27,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import safe_mean
 
 from sb3_gae import TRPOGAE, GAERolloutBuffer
-from sb3_gae.callbacks import PAPER_LAMBDAS
 from sb3_gae.diagnostics.policy_gradients import policy_gradients
 from sb3_gae.estimators.advantages import discounted_returns, td_residuals
 from sb3_gae.estimators.group_statistics import Estimate, mean_variance, squared_norm
-from sb3_gae.estimators.measures import lagged_signal, value_errors
-from sb3_gae.rollout.collection import training_batch
+from sb3_gae.estimators.measures import value_errors
+from sb3_gae.estimators.response import lagged_signal
+from sb3_gae.presets import PAPER_LAMBDAS
+from sb3_gae.rollout.evaluation import training_batch
 from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.grid import Cell
 from sb3_gae.sweep.plan import Options

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullFormatter, NullLocator
 from training_diagnostics import TASKS, Result, stored
 
-from sb3_gae.callbacks import PAPER_LAMBDAS
 from sb3_gae.estimators.advantages import effective_horizon
+from sb3_gae.presets import PAPER_LAMBDAS
 
 IMAGES = Path(__file__).parent / "images"
 TITLES = {"GaeCartPole-v0": "Cart-pole", "Pendulum-v1": "Pendulum", "GaeBiped-v0": "Biped"}

@@ -21,8 +21,8 @@ from matplotlib.ticker import FixedLocator, NullFormatter
 from scipy.stats import rankdata
 from training_diagnostics import Result, stored
 
-from sb3_gae.callbacks import PAPER_LAMBDAS
 from sb3_gae.gridworld import TabularPolicy, exact_value_errors, fitted_values, gridworld, sample_episodes
+from sb3_gae.presets import PAPER_LAMBDAS
 
 IMAGE = Path(__file__).parent / "images" / "value_errors.svg"
 LAMBDAS = (0.0, 0.92, 0.96)

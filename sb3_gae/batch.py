@@ -30,14 +30,22 @@ class TrainingBatch:
     def __len__(self) -> int:
         return len(self.advantages)
 
-    def take(self, indices: th.Tensor) -> "TrainingBatch":
+    def take(self, indices: th.Tensor | None) -> "TrainingBatch":
         """
-        :param indices: which samples, shape (n,)
-        :return: a copy of those
+        :param indices: which samples, shape (n,); None for all
+        :return: a copy of those, or the batch itself
         """
+        if indices is None:
+            return self
         return TrainingBatch(
             take(self.observations, indices), self.actions[indices], self.advantages[indices], self.value_targets[indices]
         )
+
+    def first(self) -> "TrainingBatch":
+        """
+        :return: its first sample alone, enough to see what depends on which parameters
+        """
+        return self.take(th.zeros(1, dtype=th.long, device=self.advantages.device))
 
 
 def take(observations: PyTorchObs, indices: th.Tensor | slice) -> PyTorchObs:

@@ -8,14 +8,12 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_gae.checks import check_count
+from sb3_gae.checks import check_count, check_number, check_unit_interval
 from sb3_gae.diagnostics.rollout_diagnostics import LambdaErrors, has_several_trajectories, lambda_errors
 from sb3_gae.diagnostics.rollout_file import record, save_rollout
 from sb3_gae.estimators.measures import ValueErrors, value_errors
+from sb3_gae.presets import PAPER_LAMBDAS
 from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer, LambdaSweep
-
-#: the values of the paper's cart-pole figure
-PAPER_LAMBDAS = (0.0, 0.36, 0.68, 0.84, 0.92, 0.96, 0.98, 0.99, 1.0)
 
 
 class LambdaSweepCallback(BaseCallback):
@@ -28,10 +26,12 @@ class LambdaSweepCallback(BaseCallback):
     :param lambdas: weights of longer estimates, each in [0, 1]
     :param gamma: discount factor, None for the one in training
     :param verbose: as for SB3's callbacks
+    :raises ValueError: if a number is out of range
     """
 
     def __init__(self, lambdas: Sequence[float] = PAPER_LAMBDAS, gamma: float | None = None, verbose: int = 0):
         super().__init__(verbose)
+        _check_factors(lambdas, gamma)
         self.lambdas = tuple(lambdas)
         self.gamma = gamma
         self.sweep: LambdaSweep | None = None
@@ -76,6 +76,7 @@ class GradientDiagnosticsCallback(BaseCallback):
         super().__init__(verbose)
         check_count("every", every)
         check_count("n_groups", n_groups, low=2)
+        _check_factors(lambdas, gamma)
         self.lambdas = tuple(lambdas)
         self.every = every
         self.n_groups = n_groups
@@ -140,6 +141,12 @@ class SaveRolloutCallback(BaseCallback):
         with _evaluation_mode(policy):
             recorded = record(policy, rollout_buffer, self.name or _task_name(self), rollout_buffer.gae_lambda)
         save_rollout(recorded, self.path)
+
+
+def _check_factors(lambdas: Sequence[float], gamma: float | None) -> None:
+    check_unit_interval("lambdas", lambdas)
+    if gamma is not None:
+        check_number("gamma", gamma, 0.0, 1.0)
 
 
 def _task_name(callback: BaseCallback) -> str:

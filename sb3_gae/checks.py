@@ -57,7 +57,10 @@ def check_unit_interval(name: str, factors: Any) -> None:
     :param factors: what was passed
     :raises ValueError: if it is not a list of numbers from 0 to 1, or is empty
     """
-    array = np.asarray(factors, dtype=np.float64)
+    try:
+        array = np.asarray(factors, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
     if array.ndim != 1 or array.size == 0 or not np.all((array >= 0.0) & (array <= 1.0)):
         raise ValueError(f"`{name}` must be a non-empty list of numbers in [0, 1], got {factors!r}.")
 

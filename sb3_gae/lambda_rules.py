@@ -5,13 +5,14 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from sb3_gae.checks import check_choice, check_number, check_unit_interval
+from sb3_gae.checks import check_choice, check_count, check_number, check_unit_interval
 from sb3_gae.diagnostics.rollout_diagnostics import METRICS, expected_improvement, has_several_trajectories, lambda_errors
 from sb3_gae.estimators.advantages import discounted_returns
 from sb3_gae.estimators.measures import explained_variance
-from sb3_gae.rollout.collection import training_batch
+from sb3_gae.rollout.evaluation import training_batch
 from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer
 from sb3_gae.update.natural_gradients import has_natural_gradients
 from sb3_gae.update.policy_step import policy_parameters
@@ -74,13 +75,16 @@ class ExplainedVarianceLambda:
     The simple rule, for comparison: :math:`\lambda = 1 - (1 - \lambda_{min}) \max(EV, 0)`, with EV the explained variance of
     the returns, averaged over some batches. It cannot tell noisy returns from a bad value function.
 
-    :param lowest: :math:`\lambda_{min}`, what a perfect value function gets
-    :param memory: weight of the past in the average of the explained variance
+    :param lowest: :math:`\lambda_{min}`, what a perfect value function gets, in [0, 1]
+    :param memory: weight of the past in the average of the explained variance, in [0, 1)
+    :raises ValueError: if a number is out of range
     """
 
     target_lambda: float | None = None
 
     def __init__(self, lowest: float = 0.9, memory: float = 0.8):
+        check_number("lowest", lowest, 0.0, 1.0)
+        check_number("memory", memory, 0.0, 1.0, below=True)
         self.lowest = lowest
         self.memory = memory
         self.explained_variance = 0.0
@@ -107,7 +111,7 @@ class MeasuredLambda:
 
     :param lambdas: the grid, ascending and ending with 1, which counts as unbiased
     :param start: where to begin; the nearest of the grid
-    :param memory: weight of the past in the averages
+    :param memory: weight of the past in the averages, in [0, 1]
     :param patience: batches to watch before the first move
     :param criterion: ``"squared_error"`` for the least bias squared and variance, ``"improvement"`` for the largest
         :func:`~sb3_gae.diagnostics.rollout_diagnostics.expected_improvement`
@@ -116,7 +120,8 @@ class MeasuredLambda:
     :param largest_target_lambda: what :math:`\lambda` of the value targets is at most where ``value_lambda`` is None; below,
         it is that of the advantages. What is measured is of the policy gradient, and where that is best with long sums, this
         says nothing of the noise that the value function should be fitted to
-    :raises ValueError: if the grid is no ascending list in [0, 1] that ends with 1, or a name is unknown
+    :raises ValueError: if the grid is no ascending list in [0, 1] that ends with 1, a number is out of range, or a name is
+        unknown
     """
 
     def __init__(
@@ -132,6 +137,9 @@ class MeasuredLambda:
         check_unit_interval("lambdas", lambdas)
         if lambdas[-1] != 1.0 or not np.all(np.diff(lambdas) > 0):
             raise ValueError(f"`lambdas` must ascend and end with 1, got {lambdas!r}.")
+        check_number("start", start, 0.0, 1.0)
+        check_number("memory", memory, 0.0, 1.0)
+        check_count("patience", patience, low=0)
         check_choice("criterion", criterion, CRITERIA)
         check_choice("metric", metric, METRICS)
         check_number("largest_target_lambda", largest_target_lambda, 0.0, 1.0)
@@ -158,7 +166,11 @@ class MeasuredLambda:
     def learn_from(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> dict[str, float]:
         if not has_several_trajectories(rollout_buffer):
             return {}
-        errors = lambda_errors(policy, rollout_buffer, self.lambdas, metric=self._metric_for(policy, rollout_buffer))
+        try:
+            errors = lambda_errors(policy, rollout_buffer, self.lambdas, metric=self._metric_for(policy, rollout_buffer))
+        except th.linalg.LinAlgError:
+            # Of the Fisher metric. A measurement that fails is none, and no reason to end a training
+            return {}
         squared_length, scale = errors.squared_norm + errors.variance, errors.variance[-1]
         found = np.stack([errors.bias_squared, errors.variance, errors.inner_product, squared_length])
         if not np.isfinite(found).all() or scale <= 0.0:
@@ -177,6 +189,8 @@ class MeasuredLambda:
         }
 
     def _metric_for(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> str:
+        if self.metric == "euclidean":
+            return self.metric
         batch = training_batch(rollout_buffer, policy.action_space)
         known = has_natural_gradients(policy, policy_parameters(policy, batch), batch)
         return self.metric if known else "euclidean"

@@ -10,6 +10,9 @@ from typing import Any
 
 from torch import nn
 
+#: the λ of the paper's cart-pole figures (section 6.3.1)
+PAPER_LAMBDAS = (0.0, 0.36, 0.68, 0.84, 0.92, 0.96, 0.98, 0.99, 1.0)
+
 #: ``policy_kwargs`` of the paper's cart-pole: a linear policy, a value network of 20 tanh units (section 6.2.1)
 CARTPOLE_NETWORKS: dict[str, Any] = dict(net_arch=dict(pi=[], vf=[20]), activation_fn=nn.Tanh)
 

@@ -17,7 +17,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gae.batch import TrainingBatch, random_subset, standardized
-from sb3_gae.checks import check_finite_parameters, check_finite_rollout, check_finite_step
+from sb3_gae.checks import check_finite_parameters, check_finite_rollout, check_finite_step, check_number
 from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
 from sb3_gae.lambda_rules import LambdaRule, lambda_rule
 from sb3_gae.networks.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
@@ -29,13 +29,11 @@ from sb3_gae.rollout.collection import (
     RolloutPlan,
     Step,
     TerminalObservation,
-    evaluate_rollout,
-    reward_returns,
     take_steps,
     terminal_observations,
-    training_batch,
 )
 from sb3_gae.rollout.episode_quota import EpisodeQuota
+from sb3_gae.rollout.evaluation import evaluate_rollout, reward_returns, training_batch
 from sb3_gae.rollout.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
 from sb3_gae.rollout.threads import threads_for_steps
 from sb3_gae.rollout.time_baseline import TimeBaseline
@@ -44,7 +42,7 @@ from sb3_gae.saving.resumable import ResumableModel
 from sb3_gae.update.adam_fit import adam_fit
 from sb3_gae.update.all_or_nothing import all_or_nothing
 from sb3_gae.update.policy_step import policy_parameters, policy_step
-from sb3_gae.update.shared_features import ParameterGroups, SharedParameters, policy_step_radius, shared_parameters
+from sb3_gae.update.shared_parameters import ParameterGroups, SharedParameters, policy_step_radius, shared_parameters
 from sb3_gae.update.summary import update_summary
 from sb3_gae.update.trust_region import StepRecord, TrustRegionSettings
 from sb3_gae.update.value_step import ValueFitRecord, value_parameters, value_steps
@@ -108,7 +106,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
     :param vf_optimizer: ``"trust_region"``, or ``"adam"`` for the fit of sb3-contrib's TRPO
     :param normalize_value: whether the value network's outputs are in units of a running scale of the returns
     :param curvature_samples: largest number of samples that curvature products use, drawn at random; None for all.
-        Gradients, objectives and constraints always use every sample
+        Gradients, objectives and constraints use every sample, but for the policy step's with ``sub_sampling_factor``
     :param n_episodes: collect this many whole episodes of each environment, as the paper does for cart-pole, and use the
         steps of no others; ``n_steps`` is then the most that an environment takes, and should cover the longest
         episodes. None for batches of ``n_steps`` steps
@@ -123,6 +121,8 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
     :param foreign_arguments: arguments of PPO and A2C that have no meaning here; each warns and says what to use
     :raises ValueError: if an argument is outside its domain
     :raises TypeError: if an argument is unknown, or the rollout buffer is of another kind
+    :raises ImportError: if there is no Ray for ``rollout_workers``
+    :raises WorkersLostError: if the workers cannot be started
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -178,6 +178,9 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         rollout_workers: int | None = None,
         **foreign_arguments: Any,
     ):
+        # Before anything is started: an unknown argument is an error
+        adam_arguments = {"learning_rate": learning_rate, "batch_size": batch_size, "n_critic_updates": n_critic_updates}
+        warn_of_unused(adam_arguments, vf_optimizer, foreign_arguments)
         if rollout_workers is not None:
             env = env_on_workers(env, rollout_workers)
         super().__init__(
@@ -203,8 +206,6 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
             _init_setup_model=False,
             supported_action_spaces=(spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary),
         )
-        adam_arguments = {"learning_rate": learning_rate, "batch_size": batch_size, "n_critic_updates": n_critic_updates}
-        warn_of_unused(adam_arguments, vf_optimizer, foreign_arguments)
         self.batch_size = 128 if batch_size is None else batch_size
         self.n_critic_updates = 10 if n_critic_updates is None else n_critic_updates
         self.cg_max_steps = cg_max_steps
@@ -280,6 +281,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         self._rollout_end = RolloutEnd(terminal, self._last_obs, self._last_episode_starts)
         if self._lambda_rule is not None:
             self.gae_lambda = self._lambda_rule.value(self._current_progress_remaining)
+            check_number("gae_lambda", self.gae_lambda, 0.0, 1.0)
         self._estimate_advantages(rollout_buffer)
         if self._lambda_rule is not None:
             self._learn_lambda(self._lambda_rule, rollout_buffer)
@@ -359,7 +361,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         rollout_buffer.value_lambda = self.value_lambda
         if self.value_lambda is None and self._lambda_rule is not None:
             rollout_buffer.value_lambda = self._lambda_rule.target_lambda
-        if (head := self._value_head()) is not None and head.n_batches == 0:
+        if (head := self._value_head()) is not None and head.is_as_constructed:
             head.initialize_scale(rollout_buffer.to_torch(reward_returns(rollout_buffer)))
         last_values = evaluate_rollout(self.policy, rollout_buffer, self._rollout_end)
         if self.baseline == "time":
@@ -371,9 +373,11 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         check_finite_rollout("value target", rollout_buffer.returns)
 
     def _value_head(self) -> ValueHead | None:
-        """The layer whose scale follows the returns, if it is to."""
+        """The layer whose scale follows the returns, if it is to and is not frozen."""
         head = getattr(self.policy, "value_net", None)
-        return head if self.normalize_value and self.baseline == "value" and isinstance(head, ValueHead) else None
+        if not self.normalize_value or self.baseline != "value" or not isinstance(head, ValueHead):
+            return None
+        return head if all(parameter.requires_grad for parameter in head.parameters()) else None
 
     def train(self) -> None:
         """
@@ -385,6 +389,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         If anything goes wrong, policy and optimiser are left as they were before the call.
 
         :raises NumericalError: if a gradient or a curvature product is not finite, or the linear algebra breaks down
+        :raises ValueError: if the action distribution depends on no trainable parameter
         """
         # Evaluation mode: the line search must compare one function, and batch statistics would move at each trial
         self.policy.set_training_mode(False)
@@ -411,9 +416,9 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
 
     def _step_policy(self, batch: TrainingBatch, parameters: ParameterGroups) -> StepRecord:
         advantages = standardized(batch.advantages) if self.normalize_advantage else batch.advantages
-        if self.sub_sampling_factor > 1:
-            subset = random_subset(len(batch), max(2, len(batch) // self.sub_sampling_factor), self.device)
-            batch, advantages = batch.take(subset), advantages[subset]  # type: ignore[arg-type]
+        n_samples = max(2, len(batch) // self.sub_sampling_factor)
+        if (subset := random_subset(len(batch), n_samples, self.device)) is not None:
+            batch, advantages = batch.take(subset), advantages[subset]
         settings = TrustRegionSettings(
             radius=policy_step_radius(self.target_kl, self.vf_kl_fraction) if parameters.of_both else self.target_kl,
             cg_max_steps=self.cg_max_steps,
@@ -430,7 +435,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
             values = th.as_tensor(self.rollout_buffer.values[self.rollout_buffer.mask])
             return ValueFitRecord([], values, values)
         head = self._value_head()
-        # A head that is frozen, or that the policy depends on as well, keeps its bits
+        # A head that the policy depends on as well keeps its bits
         movable = {id(parameter) for parameter in parameters.of_value}
         if head is not None and all(id(parameter) in movable for parameter in head.parameters()):
             head.update_scale(batch.value_targets)

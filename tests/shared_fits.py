@@ -12,7 +12,7 @@ from sb3_gae import SharedMlpPolicy
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.networks.distributions import snapshot
 from sb3_gae.update.policy_step import policy_parameters
-from sb3_gae.update.shared_features import ParameterGroups, SharedParameters, shared_parameters
+from sb3_gae.update.shared_parameters import ParameterGroups, SharedParameters, shared_parameters
 from sb3_gae.update.trust_region import TrustRegionSettings
 from sb3_gae.update.value_step import ValueFitRecord, value_parameters, value_steps
 

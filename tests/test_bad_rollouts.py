@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 from bad_numbers import BAD, check_refused
@@ -21,6 +22,8 @@ from envs_for_tests import (
 from gymnasium import spaces
 
 from sb3_gae import MlpPolicy, NumericalError
+from sb3_gae.rollout.collection import RolloutPlan, take_steps
+from sb3_gae.rollout.episode_quota import EpisodeQuota
 
 WORDS = {"nan": "NaN", "inf": "infinity", "-inf": "infinity"}
 
@@ -178,6 +181,20 @@ class NaNActionAtStep(MlpPolicy):
             actions[self.which, -1] = self.bad
         self.calls += 1
         return actions
+
+
+def test_exploration_that_has_shrunk_to_nothing_is_refused() -> None:
+    model = short_model(policy_kwargs={"log_std_init": -110.0})
+    check_refused(model, "standard deviation is 0")
+
+
+def test_a_bad_action_has_the_number_of_its_environment_among_all() -> None:
+    model = short_model(policy=NaNActionAtStep)
+    steps = take_steps(
+        model.policy, model.env, model.env.reset(), np.ones(3, dtype=bool), RolloutPlan(8), EpisodeQuota(3, None), first_env=6
+    )
+    with pytest.raises(NumericalError, match=r"action contains NaN at step 3 of the rollout in environment 7\b"):
+        list(steps)
 
 
 def test_a_bad_action_is_refused_before_the_environment_sees_it() -> None:

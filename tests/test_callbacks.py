@@ -1,5 +1,7 @@
 """The sweep in the log."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_gae import TRPOGAE, GAERolloutBuffer, LambdaSweepCallback
+from sb3_gae import TRPOGAE, GAERolloutBuffer, GradientDiagnosticsCallback, LambdaSweepCallback
 
 LAMBDAS = (0.0, 0.9, 1.0)
 
@@ -40,6 +42,13 @@ def test_works_with_another_algorithm_on_our_buffer() -> None:
         64, callback
     )
     assert callback.sweep is not None
+
+
+@pytest.mark.parametrize("callback", [LambdaSweepCallback, GradientDiagnosticsCallback])
+@pytest.mark.parametrize("bad", [{"lambdas": [0.5, 1.5]}, {"lambdas": ["a"]}, {"lambdas": []}, {"gamma": 1.5}])
+def test_bad_factors_are_refused_before_a_rollout(callback: Any, bad: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"`{next(iter(bad))}` must be"):
+        callback(**bad)
 
 
 def test_says_which_buffer_it_needs() -> None:

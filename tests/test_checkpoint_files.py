@@ -158,6 +158,30 @@ def test_what_is_written_is_read_before_another_is_deleted(tmp_path: Path, monke
     assert [path.name for path in checkpoints_in(tmp_path) if is_whole(path)] == [f"rl_model_{STEPS}_steps.zip"]
 
 
+def test_an_old_checkpoint_that_cannot_be_deleted_is_no_failure_of_the_new_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written, real = [], sb3_gae.saving.checkpoint_callback.write_atomically
+
+    def write(path: Path, *args: Any) -> None:
+        written.append(path)
+        real(path, *args)
+
+    def refuse(path: Path, missing_ok: bool = False) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(sb3_gae.saving.checkpoint_callback, "write_atomically", write)
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refuse)
+        with pytest.warns(
+            UserWarning, match=r"The old checkpoint .*_steps\.zip could not be deleted, and stays: .*not permitted"
+        ) as found:
+            train(tmp_path, 4, save_freq=64, keep=1)
+    assert not [warning for warning in found if "could be written" in str(warning.message)]
+    assert len(written) == len(set(written)) == 3, "each is written once, and when its time has come"
+    assert steps_in(tmp_path) == [4, 2, 0]
+
+
 def test_a_file_that_is_being_written_has_another_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
     real = os.fsync

@@ -35,7 +35,7 @@ from sb3_gae.update.conjugate_gradient import conjugate_gradient
 from sb3_gae.update.curvature import CurvatureProduct, hessian_product
 from sb3_gae.update.kronecker import KroneckerPreconditioner
 from sb3_gae.update.policy_step import DenseFisher, autograd_fisher_product, policy_parameters
-from sb3_gae.update.shared_features import shared_parameters
+from sb3_gae.update.shared_parameters import shared_parameters
 from sb3_gae.update.value_step import value_parameters
 
 N_SAMPLES = 7

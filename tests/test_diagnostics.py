@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from oracles import Rollout, direct_advantages, rollouts
 from tabular_oracles import random_policy
 
-from sb3_gae.estimators.measures import explained_variance, lagged_signal, tabular_response, value_errors
+from sb3_gae.estimators.measures import explained_variance, value_errors
+from sb3_gae.estimators.response import lagged_signal, tabular_response
 from sb3_gae.estimators.trajectory_groups import trajectory_indices
 from sb3_gae.gridworld import episode_deltas, gridworld, response_function, sample_episodes
 

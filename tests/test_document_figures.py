@@ -10,8 +10,8 @@ import pytest
 import yaml
 
 from sb3_gae import TRPOGAE
-from sb3_gae.callbacks import PAPER_LAMBDAS
 from sb3_gae.diagnostics.rollout_diagnostics import gradient_response, lambda_errors
+from sb3_gae.presets import PAPER_LAMBDAS
 from sb3_gae.zoo import default_hyperparams_path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))

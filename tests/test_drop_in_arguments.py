@@ -10,6 +10,7 @@ import torch as th
 from envs_for_tests import SMALL, train_once, vec_env
 from stable_baselines3 import A2C, PPO
 
+import sb3_gae.trpo_gae
 from sb3_gae import TRPOGAE, GAERolloutBuffer
 from sb3_gae.hyperparameters import FOREIGN_ARGUMENTS
 
@@ -135,6 +136,12 @@ def test_foreign_arguments_are_not_kept() -> None:
 def test_an_unknown_argument_is_a_type_error_that_names_it() -> None:
     with pytest.raises(TypeError, match="unexpected keyword argument 'gae_lamda'"):
         TRPOGAE("MlpPolicy", vec_env(), gae_lamda=0.9)
+
+
+def test_an_unknown_argument_is_found_before_workers_are_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sb3_gae.trpo_gae, "env_on_workers", lambda env, n_workers: pytest.fail("started"))
+    with pytest.raises(TypeError, match="gae_lamda"):
+        TRPOGAE("MlpPolicy", "CartPole-v1", rollout_workers=2, gae_lamda=0.9)
 
 
 def test_environments_can_be_named_and_policies_are_found_by_contribs_aliases() -> None:

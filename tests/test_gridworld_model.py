@@ -67,6 +67,13 @@ def test_optimal_values_are_those_of_their_greedy_policy_and_no_policy_has_bette
         np.testing.assert_allclose(greedy.values(gamma), best, atol=1e-9)
 
 
+def test_rewards_for_ever_have_no_optimal_values_without_a_discount() -> None:
+    mdp = TabularMDP(np.ones((1, 1, 1)), np.ones((1, 1, 1)), np.ones(1), np.zeros(1, dtype=bool))
+    np.testing.assert_allclose(optimal_values(mdp, 0.9), 10.0)
+    with pytest.raises(ValueError, match=r"`gamma` = 1\.0"):
+        optimal_values(mdp, 1.0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

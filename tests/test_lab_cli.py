@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from sb3_gae import lab
+from sb3_gae.estimators.group_statistics import Estimate
 from sb3_gae.lab import cli
 from sb3_gae.lab.export import recorded_run
 from sb3_gae.lab.pictures import Axes, Line, bar_chart, cell_arrows, favourite_move, line_chart, round_up
 from sb3_gae.lab.presets import load_preset
+from sb3_gae.lab.rollout_view import View
 
 
 def test_a_port_in_use_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
@@ -114,3 +116,14 @@ def test_cells_of_the_deepest_colour_can_be_read(theme: str, tint: str) -> None:
     assert contrast(colours["ink"], paper) >= 4.5
     # Arrows are pictures, not text
     assert contrast(colours["clay"], paper) >= 3.0
+
+
+def test_a_variance_above_that_of_lambda_1_stays_within_the_picture() -> None:
+    panel = pytest.importorskip("sb3_gae.lab.page.rollout_panel", reason="the extra `lab` is needed")
+    nothing, advantages = np.zeros(3), np.zeros((2, 1))
+    variance = Estimate(np.array([0.1, 3.0, 1.0]), nothing)
+    view = View(advantages, advantages, advantages, np.array([0.0, 0.5, 1.0]), Estimate(nothing, nothing), variance)
+    (points,) = re.findall(r'class="line variance" points="([^"]+)"', panel.trade_off_chart(view))
+    heights = [float(point.split(",")[1]) for point in points.split()]
+    # From the last to the first, and downwards; the axis ends at 5
+    np.testing.assert_allclose(np.diff(heights) / (heights[2] - heights[1]), [-2.0 / 2.9, 1.0], rtol=0.02)

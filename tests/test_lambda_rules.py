@@ -6,14 +6,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from envs_for_tests import differing, small_model, state_of, train_once, vec_env
+import torch as th
+from envs_for_tests import differing, short_model, small_model, state_of, train_once, vec_env
 from stable_baselines3.common.callbacks import BaseCallback
 
+import sb3_gae.lambda_rules
 from sb3_gae import TRPOGAE
 from sb3_gae.diagnostics.rollout_diagnostics import LambdaErrors, lambda_errors
 from sb3_gae.estimators.advantages import discounted_returns
 from sb3_gae.gridworld import TabularPolicy, gridworld
-from sb3_gae.lambda_rules import ExplainedVarianceLambda, MeasuredLambda
+from sb3_gae.lambda_rules import ExplainedVarianceLambda, MeasuredLambda, ScheduledLambda
 
 GRID = (0.0, 0.5, 0.8, 0.9, 0.96, 1.0)
 
@@ -145,6 +147,49 @@ def test_estimates_that_are_no_numbers_change_nothing(bad: float, monkeypatch: p
     feed(rule, monkeypatch, [Batch(bad * ones, ones), Batch(ones, ones, ones, bad * ones), Batch(0 * ones, 0 * ones)])
     assert rule.value(1.0) == 0.96
     assert rule._n_batches == 0
+
+
+def test_linear_algebra_that_breaks_down_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*args: Any, **kwargs: Any) -> Any:
+        raise th.linalg.LinAlgError("no convergence")
+
+    model = short_model(vec_env(), gae_lambda=MeasuredLambda(patience=0), n_steps=16)
+    monkeypatch.setattr(sb3_gae.lambda_rules, "lambda_errors", broken)
+    train_once(model)
+    assert model.gae_lambda == 0.96
+
+
+@pytest.mark.parametrize(
+    ("rule", "arguments"),
+    [
+        (ExplainedVarianceLambda, {"lowest": -0.5}),
+        (ExplainedVarianceLambda, {"memory": 1.0}),
+        (MeasuredLambda, {"memory": 1.5}),
+        (MeasuredLambda, {"start": 2.0}),
+        (MeasuredLambda, {"patience": 0.5}),
+    ],
+)
+def test_numbers_out_of_range_are_refused(rule: Any, arguments: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=f"`{next(iter(arguments))}` must be"):
+        rule(**arguments)
+
+
+class Wandering(ScheduledLambda):
+    """Right at first, and wrong later."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda remaining: 1.0)
+        self.n_asked = 0
+
+    def value(self, progress_remaining: float) -> float:
+        self.n_asked += 1
+        return 0.9 if self.n_asked == 1 else 1.5
+
+
+def test_a_rule_of_ones_own_that_leaves_the_interval_is_refused() -> None:
+    model = short_model(vec_env(), gae_lambda=Wandering())
+    with pytest.raises(ValueError, match=r"`gae_lambda` must be a number in \[0, 1\], got 1.5"):
+        train_once(model)
 
 
 @pytest.mark.parametrize("argument", ["criterion", "metric"])

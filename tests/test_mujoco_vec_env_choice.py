@@ -107,9 +107,14 @@ def test_one_environment_given_twice_is_refused() -> None:
             MujocoVecEnv(env_fns)
 
 
-@pytest.mark.parametrize("n_threads", [0, -1])
-def test_a_number_of_threads_below_1_is_refused(n_threads: int) -> None:
-    with pytest.raises(ValueError, match=f"`n_threads` must be at least 1 or None, got {n_threads}"):
+def test_no_environment_at_all_is_refused() -> None:
+    with pytest.raises(ValueError, match="`env_fns` must make at least one environment"):
+        batched_vec_env([])
+
+
+@pytest.mark.parametrize("n_threads", [0, -1, 1.5])
+def test_a_number_of_threads_that_is_none_is_refused(n_threads: Any) -> None:
+    with pytest.raises(ValueError, match=f"`n_threads` must be a whole number of at least 1, got {n_threads}"):
         MujocoVecEnv(functions("GaeBiped-v0", 2), n_threads)
 
 

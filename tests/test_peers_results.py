@@ -138,6 +138,7 @@ def test_tables_say_what_the_results_say(sections: dict[str, str]) -> None:
     assert rows_of(sections["reach"])[1] == ["Hopper-v5", "2 001", "350 000", "35 s", "200 s", "400 s", "0.09"]
     assert rows_of(sections["clock"])[0][2] == ""
     assert "- processor: a processor" in sections["origin"]
+    assert "each of the processor: 1.50, at most 1.50" in sections["origin"]
 
 
 def test_targets_are_met_or_not(sections: dict[str, str]) -> None:

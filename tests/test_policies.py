@@ -25,7 +25,7 @@ from torch import nn
 import sb3_gae.trpo_gae
 from sb3_gae import TRPOGAE, MlpPolicy
 from sb3_gae.networks.value_head import ValueHead
-from sb3_gae.rollout.collection import training_batch
+from sb3_gae.rollout.evaluation import training_batch
 from sb3_gae.update.policy_step import policy_parameters
 from sb3_gae.update.value_step import value_parameters
 
@@ -239,12 +239,52 @@ def test_a_frozen_value_function_stays_and_the_policy_trains(vf_optimizer: str) 
     model = model_with("separate networks", vf_optimizer=vf_optimizer)
     for parameter in [*model.policy.mlp_extractor.value_net.parameters(), *model.policy.value_net.parameters()]:
         parameter.requires_grad_(False)
-    before = {name: parameter.clone() for name, parameter in model.policy.named_parameters()}
+    before = state_of(model.policy)
     for _ in range(2):
         assert train_once(model)["train/is_line_search_success"] == 1.0
-    moved = differing(before, dict(model.policy.named_parameters()))
+    moved = differing(before, state_of(model.policy))
     assert "action_net.weight" in moved
     assert all("value_net" not in name for name in moved)
+
+
+def test_a_value_head_that_is_frozen_in_part_keeps_its_scale() -> None:
+    model = model_with("separate networks")
+    train_once(model)
+    model.policy.value_net.bias.requires_grad_(False)
+    head = state_of(model.policy.value_net)
+    train_once(model)
+    assert differing(head, state_of(model.policy.value_net)) == ["weight"]
+
+
+class OwnNames(ActorCriticPolicy):
+    """Layers and methods of its own, none of them by SB3's names."""
+
+    def _build(self, lr_schedule: Any) -> None:
+        self.act, self.judge = nn.Linear(self.features_dim, 2), nn.Linear(self.features_dim, 1)
+        self.log_std = nn.Parameter(th.zeros(2))
+        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
+
+    def get_distribution(self, obs: Any) -> Any:
+        return self.action_dist.proba_distribution(self.act(obs.float()), self.log_std)
+
+    def predict_values(self, obs: Any) -> th.Tensor:
+        return self.judge(obs.float())
+
+    def evaluate_actions(self, obs: Any, actions: th.Tensor) -> Any:
+        return self.predict_values(obs), self.get_distribution(obs).log_prob(actions), None
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+        return self.get_distribution(observation).get_actions(deterministic)
+
+
+def test_a_policy_needs_none_of_sb3s_layers() -> None:
+    check_training(small_model(vec_env(), OwnNames, policy_kwargs={}))
+
+
+def test_one_of_two_samples_is_not_few_enough_to_draw() -> None:
+    """Batches of whole episodes may be smaller than `n_steps` promises."""
+    model = small_model(vec_env(lambda: AnySpacesEnv(length=1), 2), n_episodes=1, sub_sampling_factor=2)
+    assert train_once(model)["train/is_line_search_success"] == 1.0
 
 
 def test_values_of_sb3s_own_policy_class_have_no_running_scale() -> None:

@@ -172,6 +172,29 @@ def test_without_ray_the_training_ends_with_a_checkpoint_and_goes_on_from_it(tmp
     assert differences(expected, everything(model)) == []
 
 
+@pytest.mark.parametrize("save_freq", [1, 10**6])
+def test_a_state_that_only_lost_workers_knew_is_no_checkpoint_and_the_one_before_is_named(
+    save_freq: int, tmp_path: Path
+) -> None:
+    class MarkAndLose(BaseCallback):
+        def _on_step(self) -> bool:
+            return True
+
+        def _on_rollout_end(self) -> None:
+            if self.num_timesteps == 2 * STEPS:
+                self.training_env.set_attr("mark", 1)
+                LocalCrew.gone.update(("collect", "state"))
+
+    callbacks = CallbackList([ResumableCheckpointCallback(save_freq, tmp_path), MarkAndLose()])
+    last = STEPS if save_freq == 1 else 0
+    with pytest.raises(WorkersLostError, match=rf"continue with TRPOGAE\.resume\('.*_{last}_steps\.zip', env\)\.$") as error:
+        make_model(on_workers()).learn(4 * STEPS, callback=callbacks)
+    said = "Ray is gone. No checkpoint could be written: only the workers knew where the environments stood. Make "
+    assert str(error.value).startswith(said)
+    LocalCrew.gone.clear()
+    assert TRPOGAE.resume(tmp_path, on_workers()).num_timesteps == last
+
+
 def test_without_a_callback_the_error_says_that_there_is_no_checkpoint() -> None:
     LocalCrew.gone.add("collect")
     with pytest.raises(WorkersLostError, match="No checkpoint was written"):
@@ -230,6 +253,14 @@ def test_images_are_transposed_by_workers() -> None:
     assert isinstance(model.get_env(), VecTransposeImage)
     model.learn(16)
     assert model.rollout_buffer.observations.shape[2:] == (1, 36, 36)
+
+
+def test_images_that_are_to_stay_as_they_are_do_so_on_workers() -> None:
+    env = VecTransposeImage(on_workers(functools.partial(AnySpacesEnv, IMAGE), n_envs=2), skip=True)
+    model = TRPOGAE("MlpPolicy", env, n_steps=8, seed=0, policy_kwargs=SMALL)
+    assert model.get_env() is env
+    model.learn(16)
+    assert model.rollout_buffer.observations.shape[2:] == (36, 36, 1)
 
 
 def test_callbacks_see_each_step_and_can_end_the_training() -> None:

@@ -17,7 +17,7 @@ from sb3_gae.diagnostics.projected_scores import projected_scores
 from sb3_gae.diagnostics.rollout_diagnostics import lambda_errors
 from sb3_gae.diagnostics.rollout_file import Rollout, load_rollout, save_rollout
 from sb3_gae.lab.rollout_view import SHIPPED_ROLLOUT, RolloutViewer
-from sb3_gae.rollout.collection import training_batch
+from sb3_gae.rollout.evaluation import training_batch
 
 
 @pytest.fixture(scope="module")
@@ -164,3 +164,25 @@ def test_saving_rounds_only_the_scores(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.rewards, rollout.rewards)
     scale = np.sqrt(np.square(rollout.scores).mean())
     np.testing.assert_allclose(again.scores, rollout.scores / scale, rtol=1e-3, atol=1e-3)
+
+
+def test_a_file_that_cannot_be_replaced_stays_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reader that comes at any moment finds a whole rollout."""
+    path = tmp_path / "x.npz"
+    save_rollout(small_rollout(), path)
+    before, seen = path.read_bytes(), []
+
+    def half(file: Any, **arrays: np.ndarray) -> None:
+        file.write(b"half")
+        file.flush()
+        seen.append(path.read_bytes())
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", half)
+    with pytest.raises(OSError, match="No space left"):
+        save_rollout(small_rollout(name="y"), path)
+    assert seen == [before] and path.read_bytes() == before
+    assert [found.name for found in tmp_path.iterdir()] == ["x.npz"]
+    monkeypatch.undo()
+    save_rollout(small_rollout(name="y"), path)
+    assert load_rollout(path).name == "y" and [found.name for found in tmp_path.iterdir()] == ["x.npz"]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from oracles import moved, state_of, training_batch
 from shared_fits import DEFAULTS, KINDS, distribution_of, divergence, each_kind, fit, groups_of, policy_of, values_of
 
-from sb3_gae.update.shared_features import SharedParameters, SharedStep
+from sb3_gae.update.shared_parameters import SharedParameters, SharedStep
 
 # Both constraints
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from sb3_gae import SharedMlpPolicy
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.networks.parameters import flatten
-from sb3_gae.update import shared_features, trust_region, value_step
+from sb3_gae.update import shared_parameters, trust_region, value_step
 from sb3_gae.update.conjugate_gradient import conjugate_gradient
 from sb3_gae.update.kronecker import KroneckerPreconditioner
 from sb3_gae.update.trust_region import TrustRegionSettings
@@ -102,7 +102,7 @@ def test_dense_and_autograd_steps_are_the_same(kind: str, limit: float | None, m
 
 def let_everything_be_differentiated_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(value_step, "has_dense_value", lambda policy, parameters: False)
-    monkeypatch.setattr(shared_features, "has_dense_policy", lambda policy, parameters: False)
+    monkeypatch.setattr(shared_parameters, "has_dense_policy", lambda policy, parameters: False)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -25,7 +25,7 @@ from shared_fits import distribution_of, divergence
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae import TRPOGAE, SharedMlpPolicy
-from sb3_gae.update.shared_features import policy_step_radius
+from sb3_gae.update.shared_parameters import policy_step_radius
 
 
 @pytest.mark.parametrize("fraction", [0.0, 0.01, 0.25, 0.81])

@@ -28,7 +28,7 @@ from benchmarks.update_speed import N_ACTIONS, N_STATES, Update, ours
 from sb3_gae import TRPOGAE
 from sb3_gae.networks.dense_network import DenseNetwork
 from sb3_gae.networks.parameters import flatten
-from sb3_gae.rollout.collection import training_batch
+from sb3_gae.rollout.evaluation import training_batch
 from sb3_gae.update.conjugate_gradient import CGStatus
 from sb3_gae.update.curvature import hessian_product
 

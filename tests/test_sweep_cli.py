@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from sb3_gae.sweep.arguments import make_parser
@@ -56,6 +57,18 @@ def test_results_of_several_sweeps_go_into_one_table(capsys: pytest.CaptureFixtu
     )
 
 
+def test_a_dry_run_counts_imported_cells_that_do_not_say_how_long_they_took_to_begin(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    grid = [*RUN, "--gammas", ".9", "--name", "s", *TINY]
+    assert main([*grid, "--seeds", "1"]) == 0 and main(["export", "--name", "s", "-o", "s.csv"]) == 0
+    pd.read_csv("s.csv").assign(setup_seconds=None).to_csv("s.csv", index=False)
+    assert main(["import", "s.csv", "--name", "t"]) == 0
+    capsys.readouterr()
+    assert main([*grid, "--seeds", "2", "--name", "t", "--dry-run"]) == 0
+    assert "from 2 cells that are done" in capsys.readouterr().out
+
+
 def test_cells_that_fail_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     grid = [*RUN, "--gammas", ".9", "--seeds", "1", "-params", "n_envs:1", "n_steps:1"]
     assert main(grid) == 1
@@ -75,7 +88,7 @@ def test_cells_that_fail_are_told(capsys: pytest.CaptureFixture[str]) -> None:
         ([*RUN, "--gammas", "1.5", "--seeds", "1"], "`gamma` must be a number in [0, 1], got 1.5"),
         ([*RUN, "--gammas", "1", "--seeds", "1", "--env", "CartPol-v1"], "did you mean 'CartPole-v1'?"),
         ([*RUN, "--gammas", "1"], "`seeds` is missing"),
-        ([*RUN, "--gammas", "1", "--seeds", "-1"], "`seeds` must be at least 1, got -1"),
+        ([*RUN, "--gammas", "1", "--seeds", "-1"], "`seeds` must be a whole number of at least 1, got -1"),
         ([*RUN, "--gammas", "1", "--seeds", "1", "--jobs", "0"], "`jobs` must be a whole number of at least 1, got 0"),
         ([*RUN, "--gammas", "1", "--seeds", "1", "--dry-run", "--jobs", "0"], "`jobs` must be a whole number"),
         ([*RUN, "--gammas", "1", "--seeds", "1", "--threads", "0"], "`threads` must be a whole number of at least 1"),

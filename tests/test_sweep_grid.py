@@ -111,7 +111,7 @@ def test_names_are_fit_for_files() -> None:
         ({"lambdas": []}, "`lambdas` is missing, of which the condition 'trust_region' needs at least one"),
         ({"lambdas": None, "conditions": ["no_vf", "adam"]}, "`lambdas` is missing, of which the condition 'adam'"),
         ({"gammas": []}, "The grid is empty"),
-        ({"seeds": 0}, "`seeds` must be at least 1, got 0"),
+        ({"seeds": 0}, "`seeds` must be a whole number of at least 1, got 0"),
         ({"seeds": []}, "The grid is empty"),
         ({"seeds": [-1]}, "`seeds` must be a whole number of at least 0"),
         ({"iterations": 0}, "`iterations` must be a whole number of at least 1"),

@@ -116,6 +116,16 @@ def test_other_files_are_refused(content: str | None, message: str, tmp_path: Pa
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("suffix", [".csv", ".csv.gz"])
+def test_a_file_that_was_cut_off_is_told_in_one_line(table: pd.DataFrame, suffix: str, tmp_path: Path) -> None:
+    path = export(table, tmp_path / f"results{suffix}")
+    content = path.read_bytes()
+    end = content.index(b"trust_region", len(content) // 2) if suffix == ".csv" else len(content) // 2
+    path.write_bytes(content[:end])
+    with pytest.raises(SweepError, match=r"results\S+ cannot be read as a results file \(.+\)\.$"):
+        read_results(path)
+
+
 def test_what_cannot_be_exported(table: pd.DataFrame, tmp_path: Path) -> None:
     with pytest.raises(SweepError, match=r"must end in \.csv, \.csv\.gz, \.parquet"):
         export(table, tmp_path / "results.xlsx")
@@ -252,6 +262,16 @@ def test_empty_and_mixed_selections(
         draw(kind, table, tmp_path / arguments.pop("output", "figure"), **arguments)
     assert message in str(error.value) and "\n" not in str(error.value)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_lambda_that_no_cell_has_is_said_though_there_are_cells_without_one(table: pd.DataFrame) -> None:
+    with pytest.raises(SweepError, match=r"no finished cell has gae_lambda 0\.25, 0\.75; there are 0, 0\.5, 1\.$"):
+        select(table, lambdas=(value for value in (0.25, 0.75)))
+    with pytest.raises(SweepError, match=r"no finished cell has gae_lambda 0\.5; there is none\.$"):
+        select(table, conditions=["no_vf"], lambdas=[0.5])
+    chosen = select(table, lambdas=iter([0.5]))
+    assert set(chosen["condition"]) == {"trust_region", "no_vf"}
+    assert set(chosen["gae_lambda"].dropna()) == {0.5}
 
 
 def test_runs_of_different_lengths_are_not_mixed(table: pd.DataFrame, tmp_path: Path) -> None:
@@ -409,6 +429,10 @@ def test_runs_with_other_results_are_refused(runs: pd.DataFrame, tmp_path: Path,
     said = refusal("rank", "--from", *files, capsys=capsys)
     assert "seed 1 of CartPole-v1, trust_region, γ = 1, λ = 0.5, 4 iterations is in both" in said
     assert "a.csv" in said and "b.csv with different results" in said
+    # A task may be named after what else is in the message
+    files = [str(export(one.assign(task="seed-v0"), tmp_path / f"{name}.csv")) for name, one in (("c", runs), ("d", other))]
+    said = refusal("rank", "--from", *files, capsys=capsys)
+    assert "seed 1 of seed-v0, trust_region, γ = 1, λ = 0.5, 4 iterations is in both" in said
 
 
 def with_setting(table: pd.DataFrame, **settings: Any) -> pd.DataFrame:

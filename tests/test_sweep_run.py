@@ -1,5 +1,6 @@
 """Running a sweep: what a cell means, and what happens when something goes wrong."""
 
+import contextlib
 import json
 import os
 import resource
@@ -16,6 +17,8 @@ import pandas as pd
 import pytest
 import rl_zoo3.train
 import torch as th
+from local_crew import LocalCrew
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_gae import TRPOGAE, MujocoVecEnv
 from sb3_gae.sweep import CONDITIONS, Cell, SweepError, SweepStudy, results_of, run_sweep
@@ -34,6 +37,15 @@ GRID: dict[str, Any] = dict(
 COMMAND = """
     -m sb3_gae.sweep run --env SweepTask-v0 --gammas .9 --lambdas .5 --iterations 2 --gym-packages sweep_task --name s
     --no-progress -params n_envs:1 n_steps:32 policy_kwargs:dict(net_arch=[4]) --seeds"""
+
+# A module that kills those processes of a sweep that import it first, one for each character of a file
+DEADLY = """
+import multiprocessing, os, pathlib, signal
+left = pathlib.Path("to-kill").read_text()
+if left and multiprocessing.parent_process() is not None:
+    pathlib.Path("to-kill").write_text(left[1:])
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -126,7 +138,34 @@ def test_rows_of_whole_episodes_are_those_of_the_batch() -> None:
 def test_every_condition_runs() -> None:
     table = run_sweep(seeds=1, **GRID | {"conditions": list(CONDITIONS)}, progress=False)
     assert set(table["condition"]) == set(CONDITIONS)
-    assert table[table["condition"] == "no_vf"]["gae_lambda"].isna().all()
+    without = table[table["condition"] == "no_vf"]
+    assert without["gae_lambda"].isna().all() and (without["lambda_used"] == 1.0).all()
+    assert (table[table["condition"] == "trust_region"]["lambda_used"] == 0.5).all()
+
+
+class CrewOfSize(LocalCrew):
+    """Knows for how many CPUs it was asked."""
+
+    def __init__(self, makers: Any, cpus_per_worker: int):
+        self.cpus_per_worker = cpus_per_worker
+        super().__init__(makers, cpus_per_worker)
+
+
+@pytest.mark.parametrize(("batched", "of_worker"), [(True, MujocoVecEnv), (False, DummyVecEnv)])
+def test_workers_of_a_cell_have_the_threads_that_it_may_use(
+    batched: bool, of_worker: type, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sb3_gae.workers.ray_vec_env.Crew", CrewOfSize)
+    overrides = {"n_envs": 4, "n_steps": 16, "n_episodes": None, "rollout_workers": 2, "batched_envs": batched}
+    cell = Cell("GaeCartPole-v0", "trust_region", 0.9, 0.5, 0, 2, json.dumps(overrides))
+    experiment = Experiment(cell, Options(threads=2))
+    assert experiment.model.env is not None
+    crew: Any = experiment.model.env.unwrapped._crew  # type: ignore[attr-defined]
+    assert [type(worker._env) for worker in crew._workers] == [of_worker] * 2
+    assert crew.cpus_per_worker == 2
+    rows: list[Row] = []
+    experiment.run(rows.append)
+    assert [row["timesteps"] for row in rows] == [64, 128]
 
 
 def test_a_failing_cell_is_recorded_and_the_others_go_on() -> None:
@@ -191,6 +230,25 @@ def test_a_worker_that_is_killed_is_replaced() -> None:
     assert sorted(runs()) == [0, 1, 1, 2]
     assert [(seed, outcome) for seed, outcome, _ in outcomes()] == [(1, Outcome.LOST)]
     assert [standing.status for standing in SweepStudy("s").standings().values()] == [Status.DONE] * 3
+
+
+@pytest.mark.parametrize(("n_killed", "ends"), [(2, False), (4, True)])
+def test_processes_that_are_killed_before_they_have_a_cell_end_the_sweep_at_last(
+    n_killed: int, ends: bool, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (folder / "deadly.py").write_text(DEADLY)
+    Path("to-kill").write_text("x" * n_killed)
+    # So that spawned processes find it
+    monkeypatch.syspath_prepend(str(folder))
+    grid = GRID | {"gym_packages": ["sweep_task", "deadly"]}
+    with (
+        pytest.raises(SweepError, match="3 processes in a row were killed by signal 9 before")
+        if ends
+        else contextlib.nullcontext()
+    ):
+        run_sweep(seeds=1, **grid, jobs=2, progress=False)
+    assert runs() == ([] if ends else [0])
+    assert len(Path("to-kill").read_text()) == n_killed - (3 if ends else 2)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

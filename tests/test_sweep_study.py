@@ -22,7 +22,7 @@ from sb3_gae.sweep.ledger import MAX_LOST, Outcome, Status
 from sb3_gae.sweep.liveness import sign_of_life, why_dead
 from sb3_gae.sweep.patience import Patience
 from sb3_gae.sweep.storage import holds, storage_errors
-from sb3_gae.sweep.study import TakenOverError
+from sb3_gae.sweep.study import Claim, TakenOverError
 
 CELLS = [Cell("CartPole-v1", "trust_region", 0.9, value, 0, 3) for value in (0.0, 0.5, 1.0)]
 ROW = {"iteration": 1, "mean_return": 5.0}
@@ -149,6 +149,60 @@ def test_a_cell_that_is_lost_at_once_is_left_alone(journal: str, monkeypatch: py
     assert claim is not None and claim.cell == CELLS[1]
 
 
+@pytest.mark.parametrize("reaches", [True, False])
+def test_a_cell_that_is_taken_while_the_connection_breaks_is_had_or_left_to_whoever_has_it(
+    reaches: bool, location: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study, other = SweepStudy("s", location, patience=Patience(60.0)), SweepStudy("s", location)
+    study.enqueue(CELLS[:2])
+    set_state = study.storage.set_trial_state_values
+    others: list[Claim | None] = []
+    broken: list[int] = []
+
+    def set_state_and_break(trial_id: int, state: TrialState, *values: list[float]) -> bool:
+        if broken:
+            return set_state(trial_id, state, *values)
+        broken.append(trial_id)
+        if reaches:
+            assert set_state(trial_id, state)
+        else:
+            others.append(other.claim(CELLS))
+        raise UnreachableError("The connection is gone.")
+
+    monkeypatch.setattr(study.storage, "set_trial_state_values", set_state_and_break)
+    claim = study.claim(CELLS)
+    assert claim is not None and claim.cell == CELLS[0 if reaches else 1]
+    claim.complete(1.0)
+    assert len(others) == (0 if reaches else 1)
+    for theirs in others:
+        assert theirs is not None
+        theirs.complete(2.0)
+    table = study.standings()
+    assert [table[cell.key].status for cell in CELLS[:2]] == ([Status.DONE, Status.WAITING] if reaches else [Status.DONE] * 2)
+    ended = [trial.user_attrs["outcome"] for trial in study.trials() if "outcome" in trial.user_attrs]
+    assert ended == ([Outcome.STOPPED] if reaches else []), "nothing counts as lost with its process"
+
+
+def test_a_cell_that_is_given_back_is_not_run_by_its_owner(location: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two that are cut off one may have it, and has not said so yet."""
+    study, other = SweepStudy("s", location, patience=Patience(60.0)), SweepStudy("s", location)
+    study.enqueue(CELLS[:1])
+    set_state = study.storage.set_trial_state_values
+    broken: list[int] = []
+
+    def set_state_and_break(trial_id: int, state: TrialState, *values: list[float]) -> bool:
+        if broken:
+            return set_state(trial_id, state, *values)
+        broken.append(trial_id)
+        assert other.storage.set_trial_state_values(trial_id, state)
+        raise UnreachableError("The connection is gone.")
+
+    monkeypatch.setattr(study.storage, "set_trial_state_values", set_state_and_break)
+    assert study.claim(CELLS[:1]) is not None
+    with pytest.raises(TakenOverError):
+        Claim(other, CELLS[0], study.storage.get_trial_id_from_study_id_trial_number(study._study_id, 0))
+
+
 @pytest.mark.parametrize(
     ("patience", "waits"), [(Patience(60.0, stop=lambda: True), False), (Patience(0.5), True), (Patience(), False)]
 )
@@ -184,6 +238,20 @@ def test_signs_of_life() -> None:
     if Path("/proc/self/stat").exists():
         # The number belongs to another process by now
         assert why_dead(sign | {"started": sign["started"] - 1}, time.time()) is not None
+
+
+@pytest.mark.skipif(not Path("/proc/self/ns/pid").exists(), reason="has no namespaces")
+def test_processes_of_another_container_with_the_same_name_are_not_looked_for_here() -> None:
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    sign = sign_of_life() | {"pid": ended.pid}
+    assert "ended without a word" in str(why_dead(sign, time.time()))
+    there = sign | {"pid_namespace": sign["pid_namespace"] + 1}
+    assert why_dead(there, time.time()) is None
+    assert "no sign of life" in str(why_dead(there, sign["time"] + 1000.0))
+    # As it was stored before namespaces were
+    del sign["pid_namespace"]
+    assert "ended without a word" in str(why_dead(sign, time.time()))
 
 
 @pytest.mark.parametrize("torn", ['{"op_code":8,"worker_id":"x', "x" * 3_000_000], ids=["short", "long"])

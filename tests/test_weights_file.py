@@ -83,6 +83,41 @@ def test_adam_gsde_and_a_rule_for_lambda_come_back_as_far_as_they_are_settings(t
     assert differing(state_of(model.policy), state_of(loaded.policy)) == []
 
 
+@pytest.mark.parametrize("by", ["save_weights", "save"])
+def test_the_learning_rate_of_adam_comes_back(by: str, tmp_path: Path) -> None:
+    model = trained(vf_optimizer="adam", learning_rate=1e-4)
+    getattr(model, by)(tmp_path / "model.zip")
+    loaded = TRPOGAE.load_weights(tmp_path / "model.zip", vec_env())
+    assert loaded.learning_rate == 1e-4 and loaded.policy.optimizer.param_groups[0]["lr"] == 1e-4
+    assert TRPOGAE.load_weights(tmp_path / "model.zip", vec_env(), learning_rate=0.5).learning_rate == 0.5
+
+
+def test_a_schedule_of_the_learning_rate_is_refused_where_it_has_an_effect(tmp_path: Path) -> None:
+    schedule = lambda progress: 1e-3 * progress  # noqa: E731
+    model = trained(vf_optimizer="adam", learning_rate=schedule)
+    with pytest.raises(ValueError, match=r"`learning_rate` is a schedule.*or set `model\.learning_rate` to a number"):
+        model.save_weights(tmp_path / "model")
+    assert list(tmp_path.iterdir()) == []
+    model.learning_rate = 2e-4
+    model.save_weights(tmp_path / "model")
+    assert TRPOGAE.load_weights(tmp_path / "model", vec_env()).learning_rate == 2e-4
+    with pytest.warns(UserWarning, match="`learning_rate` has no effect here"):
+        trained(learning_rate=schedule).save_weights(tmp_path / "model")
+    TRPOGAE.load_weights(tmp_path / "model", vec_env())
+
+
+def test_numbers_of_numpy_come_back_as_numbers(tmp_path: Path) -> None:
+    settings: Any = dict(n_steps=np.int64(16), target_kl=np.float32(0.5), normalize_advantage=np.bool_(False))
+    policy_kwargs = {"net_arch": dict(pi=[np.int64(8)], vf=[4]), "log_std_init": np.float32(-0.5)}
+    model = trained(**settings, policy_kwargs=policy_kwargs, vf_optimizer="adam", learning_rate=0.25)
+    model.save_weights(tmp_path / "model")
+    loaded = TRPOGAE.load_weights(tmp_path / "model", vec_env())
+    assert {name: getattr(loaded, name) for name in settings} == settings
+    assert type(loaded.n_steps) is int and loaded.learning_rate == 0.25
+    assert loaded.policy_kwargs == policy_kwargs
+    assert differing(state_of(model.policy), state_of(loaded.policy)) == []
+
+
 def test_the_file_is_one_of_safetensors(content: bytes, model: TRPOGAE) -> None:
     """By its documented layout."""
     length = struct.unpack("<Q", content[:8])[0]
@@ -96,6 +131,13 @@ def test_the_file_is_one_of_safetensors(content: bytes, model: TRPOGAE) -> None:
 
 def test_arguments_replace_what_is_in_the_file(content: bytes, tmp_path: Path) -> None:
     assert load(content, tmp_path, gamma=0.5, n_steps=8).gamma == 0.5
+
+
+def test_what_is_wrong_with_an_argument_is_not_put_down_to_the_file(content: bytes, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match=r"got an unexpected keyword argument 'gama'$"):
+        load(content, tmp_path, gama=0.5)
+    with pytest.raises(ValueError, match=r"The settings in \S+ with your 'n_steps' make no model"):
+        load(content, tmp_path, n_steps=10**15)
 
 
 def test_weights_of_another_algorithm_are_taken(tmp_path: Path) -> None:
@@ -141,7 +183,9 @@ def resealed(content: bytes, **changes: Any) -> bytes:
     [
         ({"gamma": 2.0}, "`gamma` must be"),
         ({"n_steps": -1}, "`n_steps` must be"),
-        ({"n_steps": 10**15}, "make no model"),
+        ({"n_steps": 10**15}, r"The settings in \S+ make no model"),
+        ({"vf_optimizer": "adam", "learning_rate": "fast"}, "`learning_rate` must be a number"),
+        ({"vf_optimizer": "adam", "learning_rate": -1.0}, "`learning_rate` must be a number"),
         ({"vf_optimizer": "os.system"}, "`vf_optimizer` must be"),
         ({"gae_lambda": "auto"}, "`gae_lambda` in the file must be a number"),
         ({"policy": "subprocess.Popen"}, "`policy` must be one of"),

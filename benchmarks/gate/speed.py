@@ -10,7 +10,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from benchmarks.update_speed import Update, ours, theirs
 from sb3_gae import TRPOGAE
 from sb3_gae.batch import standardized
-from sb3_gae.rollout.collection import training_batch
+from sb3_gae.rollout.evaluation import training_batch
 from sb3_gae.vec_env.choice import batched_vec_env
 
 BATCH = 12_288

@@ -16,7 +16,8 @@ class Run(NamedTuple):
 
     :param seed: of the training
     :param steps: of training until then
-    :param seconds: of training until then
+    :param seconds: of training until then, of the processor: one thread on a core of its own, so that nothing else on the
+        machine counts
     :param returns: mean over the episodes
     """
 
@@ -45,7 +46,7 @@ def runs_of(table: pd.DataFrame, task: str, algorithm: str, steps: int, variant:
     wanted = (table["task"] == task) & (table["algorithm"] == algorithm) & (table["steps"] == steps)
     chosen = table[wanted & (table["variant"] == variant)]
     return [
-        Run(int(seed), *(rows.sort_values("step")[name].to_numpy(float) for name in ("step", "wall_seconds", "mean_return")))
+        Run(int(seed), *(rows.sort_values("step")[name].to_numpy(float) for name in ("step", "cpu_seconds", "mean_return")))
         for seed, rows in chosen.groupby("seed")
     ]
 

@@ -211,7 +211,19 @@ def origin_list(table: pd.DataFrame) -> str:
     held = {
         title: sorted({str(value) for value in table[name] if value != ""}) for name, title in names.items() if name in table
     }
-    return "\n".join(f"- {title}: {', '.join(values)}" for title, values in held.items() if values)
+    lines = [f"- {title}: {', '.join(values)}" for title, values in held.items() if values]
+    return "\n".join([*lines, f"- {_disturbance(table)}"])
+
+
+def _disturbance(table: pd.DataFrame) -> str:
+    """How much longer than the processor's the seconds of the wall were."""
+    ends = (
+        table.sort_values("step")
+        .groupby(["task", "algorithm", "variant", "seed", "steps"])[["wall_seconds", "cpu_seconds"]]
+        .last()
+    )
+    ratios = ends["wall_seconds"] / ends["cpu_seconds"]
+    return f"seconds of the wall for each of the processor: {ratios.median():.2f}, at most {ratios.max():.2f}"
 
 
 def number(value: float) -> str:

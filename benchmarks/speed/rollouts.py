@@ -14,8 +14,8 @@ from sb3_gae import TRPOGAE
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.networks.distributions import snapshot
 from sb3_gae.presets import LOCOMOTION_NETWORKS
-from sb3_gae.rollout.collection import training_batch
-from sb3_gae.update.shared_features import ParameterGroups
+from sb3_gae.rollout.evaluation import training_batch
+from sb3_gae.update.shared_parameters import ParameterGroups
 
 #: of the paper's robots
 HIDDEN = tuple(LOCOMOTION_NETWORKS["net_arch"]["pi"])

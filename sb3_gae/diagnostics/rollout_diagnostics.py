@@ -16,9 +16,9 @@ from sb3_gae.checks import check_choice, check_count, check_number, check_unit_i
 from sb3_gae.diagnostics.policy_gradients import policy_gradients
 from sb3_gae.estimators.advantages import advantage_grid, td_residuals
 from sb3_gae.estimators.group_statistics import Estimate, gradient_errors, squared_norm
-from sb3_gae.estimators.measures import lagged_signal
+from sb3_gae.estimators.response import lagged_signal
 from sb3_gae.estimators.trajectory_groups import trajectory_groups, trajectory_indices
-from sb3_gae.rollout.collection import training_batch
+from sb3_gae.rollout.evaluation import training_batch
 from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer
 from sb3_gae.update.natural_gradients import natural_gradients
 from sb3_gae.update.policy_step import policy_parameters

@@ -18,7 +18,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae.checks import check_number
 from sb3_gae.diagnostics.projected_scores import projected_scores
-from sb3_gae.rollout.collection import training_batch
+from sb3_gae.rollout.evaluation import training_batch
 from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer
 
 FORMAT = "sb3-gae rollout 1"
@@ -102,14 +102,22 @@ def record(policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer, name: st
 def save_rollout(rollout: Rollout, path: str | pathlib.Path) -> None:
     """
     :param rollout: to write; scores are rounded to half precision, in units of their root mean square
-    :param path: of the file, which is replaced
+    :param path: of the file, which is replaced once the new one is written: a reader never sees half of it
+    :raises OSError: if it cannot be written; what was there before is still there
     """
     scale = float(np.sqrt(np.square(rollout.scores).mean())) or 1.0
     # Half precision ends at 65 504
     scores = np.clip(rollout.scores / scale, -6e4, 6e4).astype(np.float16)
     arrays = {name: getattr(rollout, name) for name in _ARRAYS if name not in ("format", "scores")}
-    with pathlib.Path(path).open("wb") as file:
-        np.savez_compressed(file, format=np.array(FORMAT), scores=scores, **arrays)
+    place = pathlib.Path(path)
+    temporary = place.with_name(f".{place.name}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, format=np.array(FORMAT), scores=scores, **arrays)
+        temporary.replace(place)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def load_rollout(source: str | pathlib.Path | bytes) -> Rollout:

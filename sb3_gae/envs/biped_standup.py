@@ -20,7 +20,7 @@ class BipedStandup(Biped):
         self.target_head_height = target_head_height
 
     def initial_state(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Lying on the back above the floor, joints, turn and velocities moved by up to ``reset_noise``."""
+        """Lying on the back above the floor; place, joints, turn and velocities moved by up to ``reset_noise``."""
         qpos, qvel = super().initial_state(rng)
         half_turn = -math.pi / 4 + 0.5 * rng.uniform(-self.reset_noise, self.reset_noise)
         qpos[2] = _START_HEIGHT
@@ -47,7 +47,7 @@ class GaeBipedStandupEnv(MujocoTaskEnv):
     **Reward**, by name in ``info``: ``head_height_cost`` (:math:`-(h - 1.5)^2`, h the height of the head in m) and
     ``torque_cost`` (:math:`-10^{-5}|u|^2`, u in N·m).
 
-    **End**: never before the time limit. **Start**: on the back, joints, turn and velocities moved by up to 0.05.
+    **End**: never before the time limit. **Start**: on the back; place, joints, turn and velocities moved by up to 0.05.
 
     :param task_kwargs: ``torque_cost_weight``, ``target_head_height`` and ``reset_noise``, by default as above
     """

@@ -16,6 +16,9 @@ from sb3_gae.checks import check_count, check_number
 MOVES = ((-1, 0), (0, 1), (1, 0), (0, -1))
 MOVE_NAMES = ("up", "right", "down", "left")
 
+# Of value iteration; enough for a discount of 0.9997
+_MOST_ITERATIONS = 100_000
+
 Cell = tuple[int, int]
 
 
@@ -102,19 +105,21 @@ def optimal_values(mdp: TabularMDP, gamma: float, tolerance: float = 1e-12) -> n
     r"""
     Values of the best policy, :math:`\max_\pi V^{\pi,\gamma}`, by value iteration from zero.
 
-    :param mdp: any
+    :param mdp: with ``gamma`` = 1, one in which no policy earns rewards for ever
     :param gamma: discount factor in [0, 1]
     :param tolerance: iteration ends when no value changes by more
     :return: shape (S,)
-    :raises ValueError: if ``gamma`` is out of range
+    :raises ValueError: if ``gamma`` is out of range, or so large that the values do not settle
     """
     check_number("gamma", gamma, 0.0, 1.0)
     rewards = np.einsum("sat,sat->sa", mdp.transitions, mdp.rewards)
-    values, change = np.zeros(mdp.n_states), np.inf
-    while change > tolerance:
+    values = np.zeros(mdp.n_states)
+    for _ in range(_MOST_ITERATIONS):
         better = (rewards + gamma * mdp.transitions @ values).max(axis=1)
         change, values = float(np.abs(better - values).max()), better
-    return values
+        if change <= tolerance:
+            return values
+    raise ValueError(f"With `gamma` = {gamma} the values did not settle; where rewards go on for ever it must be smaller.")
 
 
 def _moves_one_way(move: Cell, size: int) -> np.ndarray:
@@ -125,7 +130,7 @@ def _moves_one_way(move: Cell, size: int) -> np.ndarray:
 
 
 def _start_probabilities(start: Cell | ArrayLike, size: int) -> np.ndarray:
-    if np.shape(start) == (2,) and size != 1 and np.asarray(start).dtype.kind == "i":
+    if np.shape(start) == (2,) and np.asarray(start).dtype.kind == "i":
         return np.eye(size**2)[_state("start", start, size)]  # type: ignore[arg-type]
     if np.shape(start) != (size, size):
         raise ValueError(f"`start` must be a cell or have the shape {(size, size)}, got the shape {np.shape(start)}.")

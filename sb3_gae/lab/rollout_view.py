@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_gae.callbacks import PAPER_LAMBDAS
 from sb3_gae.checks import check_number
 from sb3_gae.diagnostics.rollout_file import Rollout
 from sb3_gae.estimators.advantages import advantage_grid, td_residuals
 from sb3_gae.estimators.group_statistics import Estimate, gradient_errors, squared_norm
-from sb3_gae.estimators.measures import lagged_signal
+from sb3_gae.estimators.response import lagged_signal
 from sb3_gae.estimators.trajectory_groups import trajectory_groups, trajectory_indices
+from sb3_gae.presets import PAPER_LAMBDAS
 
 #: the paper's biped after a short training, made by ``docs/record_biped.py``
 SHIPPED_ROLLOUT = Path(__file__).parent / "biped.npz"

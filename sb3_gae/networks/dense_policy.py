@@ -26,11 +26,10 @@ def has_dense_policy(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor])
     :param parameters: what the action distribution was found to depend on
     :return: whether that is exactly an MLP as SB3 builds it, on features that have no parameters
     """
-    layers = _policy_layers(policy)
     return (
         _inherits(policy, "get_distribution", "extract_features", "_get_action_dist_from_latent")
         and type(policy.action_dist) in FISHER_METRICS
-        and _hold_exactly(layers, policy_log_std(policy), parameters)
+        and _hold_exactly(_policy_layers(policy), policy_log_std(policy), parameters)
     )
 
 
@@ -40,8 +39,10 @@ def has_dense_value(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor]) 
     :param parameters: what the value step may move
     :return: whether that is exactly an MLP as SB3 builds it, on features that the step does not move
     """
-    _, layers = _value_layers(policy, parameters)
-    return _inherits(policy, "predict_values", "extract_features") and _hold_exactly(layers, [], parameters)
+    # In this order: a policy with methods of its own need not have SB3's layers
+    return _inherits(policy, "predict_values", "extract_features") and _hold_exactly(
+        _value_layers(policy, parameters)[1], [], parameters
+    )
 
 
 def gaussian_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
@@ -93,7 +94,7 @@ def policy_log_std(policy: ActorCriticPolicy) -> list[th.Tensor]:
 
 
 def _policy_layers(policy: ActorCriticPolicy) -> list[nn.Module]:
-    return _layers(policy, "policy_net", policy.action_net)
+    return _layers(policy, "policy_net", getattr(policy, "action_net", None))
 
 
 def _value_layers(
@@ -110,9 +111,11 @@ def _value_layers(
     return fixed, layers[len(fixed) :]
 
 
-def _layers(policy: ActorCriticPolicy, body: str, head: nn.Module) -> list[nn.Module]:
-    """The layers in order; empty for an extractor that is not SB3's own."""
-    return [*getattr(policy.mlp_extractor, body), head] if type(policy.mlp_extractor) is MlpExtractor else []
+def _layers(policy: ActorCriticPolicy, body: str, head: nn.Module | None) -> list[nn.Module]:
+    """The layers in order; empty for an extractor that is not SB3's own, or a policy that lacks the head."""
+    if head is None or type(policy.mlp_extractor) is not MlpExtractor:
+        return []
+    return [*getattr(policy.mlp_extractor, body), head]
 
 
 def _hold_exactly(layers: Sequence[nn.Module], others: Sequence[th.Tensor], parameters: Sequence[th.Tensor]) -> bool:

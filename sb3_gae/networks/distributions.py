@@ -21,7 +21,7 @@ def snapshot(distribution: Distribution) -> Distribution:
     """
     SB3 policies own one distribution object and refill it at every call; this one stays as it is now.
 
-    :param distribution: computed without a graph
+    :param distribution: of any kind; a graph that it has stays attached
     :return: a shallow copy
     """
     return copy.copy(distribution)

@@ -46,6 +46,11 @@ class ValueHead(nn.Linear):
         layer.weight, layer.bias = self.weight, self.bias
         return layer
 
+    @property
+    def is_as_constructed(self) -> bool:
+        """Whether neither a factor nor weights with one have been set."""
+        return bool(self.n_batches == 0 and self.scale == 1.0)
+
     @th.no_grad()
     def initialize_scale(self, returns: th.Tensor) -> None:
         """
@@ -54,7 +59,7 @@ class ValueHead(nn.Linear):
         :param returns: any shape; all zeros, or next to it, leave the factor at 1
         """
         root_mean_square = _root_mean_square(returns)
-        if self.n_batches == 0 and _can_divide_by(root_mean_square):
+        if self.is_as_constructed and _can_divide_by(root_mean_square):
             self.scale.fill_(root_mean_square)
 
     @th.no_grad()

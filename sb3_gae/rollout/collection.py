@@ -1,4 +1,4 @@
-"""Pieces of the collection of a rollout: its steps, endings of a step, values of the whole, and what to train on."""
+"""The steps of a rollout, and how they end."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
@@ -10,13 +10,10 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_gae.batch import TrainingBatch, as_float, in_chunks
-from sb3_gae.checks import check_finite_rollout, check_finite_step
+from sb3_gae.checks import check_finite_step
 from sb3_gae.errors import NumericalError
-from sb3_gae.estimators.advantages import discounted_returns
 from sb3_gae.networks.dense_policy import gaussian_layers
 from sb3_gae.rollout.episode_quota import EpisodeQuota
-from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer
 
 Observations = np.ndarray | dict[str, np.ndarray]
 
@@ -109,12 +106,17 @@ class ActionSampler:
     distribution in each step.
 
     :param policy: in evaluation mode
+    :param first_env: number of the first environment, for messages
+    :raises NumericalError: if the exploration has shrunk to nothing
     """
 
-    def __init__(self, policy: ActorCriticPolicy):
+    def __init__(self, policy: ActorCriticPolicy, first_env: int = 0):
         self._policy = policy
+        self._first_env = first_env
         self._layers = gaussian_layers(policy)
         self._std = policy.log_std.detach().exp() if self._layers else None
+        if self._std is not None and not (self._std > 0.0).all():
+            raise NumericalError("The policy's standard deviation is 0 in single precision; there is nothing left to explore.")
 
     def __call__(self, observations: Observations, step: int) -> np.ndarray:
         """
@@ -130,7 +132,7 @@ class ActionSampler:
         except ValueError as error:
             # So torch refuses the parameters of a distribution
             raise NumericalError(f"The action distribution is invalid at step {step} of the rollout: {error}") from error
-        check_finite_step("action", actions, step)
+        check_finite_step("action", actions, step, self._first_env)
         return actions
 
     def _draw(self, observations: Any) -> th.Tensor:
@@ -177,7 +179,7 @@ def take_steps(
     """
     if plan.use_sde:
         policy.reset_noise(env.num_envs)
-    sample = ActionSampler(policy)
+    sample = ActionSampler(policy, first_env)
     for step in range(plan.n_steps):
         if quota.is_met:
             return
@@ -209,81 +211,15 @@ def terminal_observations(step: int, dones: np.ndarray, infos: list[dict[str, An
         if infos[env].get("TimeLimit.truncated", False) and infos[env].get("terminal_observation") is not None
     ]
     for ending in endings:
-        check_finite_step("terminal observation", _stack([ending.observation]), step, ending.env)
+        check_finite_step("terminal observation", stacked([ending.observation]), step, ending.env)
     return endings
 
 
-def evaluate_rollout(policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer, end: RolloutEnd) -> th.Tensor:
+def stacked(observations: list[Observations]) -> Observations:
     """
-    Give a full buffer its values and log-probabilities, computed for all of it at once.
-
-    :param policy: in evaluation mode, as it was when the rollout was collected
-    :param rollout_buffer: full
-    :param end: of the rollout
-    :return: values of the last observations, shape (N,)
-    :raises NumericalError: if a value or a log-probability is not finite
+    :param observations: of single environments, without a batch axis
+    :return: shape (n, ...), or a dictionary of such
     """
-    samples, mask = rollout_buffer.batch(), rollout_buffer.mask
-    actions = distribution_actions(policy.action_space, samples.actions)
-
-    def evaluate(observations: Any, actions: th.Tensor) -> th.Tensor:
-        values, log_probs, _ = policy.evaluate_actions(observations, actions)
-        return th.stack([values.flatten(), log_probs], dim=1)
-
-    evaluated = in_chunks(evaluate, samples.observations, actions).cpu().numpy()
-    values, log_probs = np.zeros((2, *mask.shape), dtype=evaluated.dtype)
-    values[mask], log_probs[mask] = evaluated.T
-    check_finite_rollout("value", values)
-    check_finite_rollout("log-probability", log_probs)
-    rollout_buffer.set_values(values, log_probs, _bootstrap_values(policy, end.terminal, mask.shape))
-    return _predict_values(policy, end.observations)
-
-
-def distribution_actions(action_space: spaces.Space, actions: th.Tensor) -> th.Tensor:
-    """
-    :param action_space: of the environment
-    :param actions: as the buffer keeps them, shape (B, n_actions)
-    :return: as the distribution takes them: whole numbers of shape (B,) for Discrete
-    """
-    return actions.long().flatten() if isinstance(action_space, spaces.Discrete) else actions
-
-
-def training_batch(rollout_buffer: GAERolloutBuffer, action_space: spaces.Space) -> TrainingBatch:
-    """
-    :param rollout_buffer: full, with its advantages computed
-    :param action_space: of the environment
-    :return: all of it, flattened, as the steps of an update take it
-    """
-    samples = rollout_buffer.batch()
-    actions = distribution_actions(action_space, samples.actions)
-    return TrainingBatch(as_float(samples.observations), actions, samples.advantages, samples.returns)
-
-
-def reward_returns(rollout_buffer: GAERolloutBuffer) -> np.ndarray:
-    """
-    :param rollout_buffer: full
-    :return: discounted returns of the rewards alone, no value function involved, shape (``n_samples``,)
-    :raises NumericalError: if a return is not finite
-    """
-    nothing = np.zeros_like(rollout_buffer.rewards)
-    returns = discounted_returns(rollout_buffer.rewards, nothing, rollout_buffer.dones, rollout_buffer.gamma)
-    check_finite_rollout("discounted return", returns)
-    return returns[rollout_buffer.mask]
-
-
-def _bootstrap_values(policy: ActorCriticPolicy, terminal: list[TerminalObservation], shape: tuple[int, ...]) -> np.ndarray:
-    bootstrap_values = np.zeros(shape, dtype=np.float32)
-    if terminal:
-        steps, envs = [ending.step for ending in terminal], [ending.env for ending in terminal]
-        bootstrap_values[steps, envs] = _predict_values(policy, _stack([ending.observation for ending in terminal])).cpu()
-    return bootstrap_values
-
-
-def _predict_values(policy: ActorCriticPolicy, observations: Observations) -> th.Tensor:
-    return in_chunks(lambda part: policy.predict_values(part).flatten(), obs_as_tensor(observations, policy.device))
-
-
-def _stack(observations: list[Observations]) -> Observations:
     if isinstance(observations[0], dict):
         return {key: np.stack([observation[key] for observation in observations]) for key in observations[0]}
     return np.stack(observations)  # type: ignore[arg-type]

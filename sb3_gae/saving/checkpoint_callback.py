@@ -8,6 +8,8 @@ from typing import cast
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_gae.checks import check_choice, check_count
+from sb3_gae.errors import WorkersLostError
+from sb3_gae.saving.atomic_write import write_atomically
 from sb3_gae.saving.callback_state import CallbackStates, callback_states, restore_callbacks
 from sb3_gae.saving.checkpoint_file import (
     checkpoint_content,
@@ -16,7 +18,6 @@ from sb3_gae.saving.checkpoint_file import (
     is_whole,
     read_checkpoint,
     timesteps_of,
-    write_atomically,
 )
 from sb3_gae.saving.deferred_signals import DeferredSignals
 from sb3_gae.saving.resumable import ResumableModel
@@ -36,7 +37,7 @@ class ResumableCheckpointCallback(BaseCallback):
     says how to continue; the second one counts at once.
 
     A checkpoint appears under its name when it is all on the disk. Older ones are deleted once the new one has been read
-    again. If it cannot be written, there is a warning and the training goes on.
+    again. If one cannot be written or deleted, there is a warning and the training goes on.
 
     :param save_freq: calls of ``env.step()`` from one checkpoint to the next, as in SB3's ``CheckpointCallback``
     :param save_path: folder of the checkpoints of one training
@@ -131,7 +132,6 @@ class ResumableCheckpointCallback(BaseCallback):
             content = checkpoint_content(self.model, training_state(self.model, states))
             write_atomically(path, content, self.save_path / f".{self.name_prefix}.tmp")
             read_checkpoint(path)
-            self._delete_old()
         except (OSError, ValueError) as error:
             # At the next iteration again
             self._next_save = self.n_calls
@@ -140,19 +140,35 @@ class ResumableCheckpointCallback(BaseCallback):
         self._last_saved = self.model.num_timesteps
         if self.verbose >= 1:
             print(f"Saving checkpoint to {path}")
+        self._delete_old()
 
     def _save_what_is_left(self) -> str:
-        self._save()
-        if not is_whole(self._path):
-            return "No checkpoint could be written."
-        kind = type(self.model).__name__
-        return f"Make environments anew, and continue with {kind}.resume({str(self._path)!r}, env)."
+        said = []
+        try:
+            self._save()
+        except WorkersLostError:
+            # As they do after `env_method` and `set_attr`, until the next batch
+            said.append("No checkpoint could be written: only the workers knew where the environments stood.")
+        else:
+            if not is_whole(self._path):
+                said.append("No checkpoint could be written.")
+        # The one of now, or one before
+        if whole := self._whole_checkpoints():
+            kind = type(self.model).__name__
+            said.append(f"Make environments anew, and continue with {kind}.resume({str(whole[0])!r}, env).")
+        return " ".join(said)
+
+    def _whole_checkpoints(self) -> list[Path]:
+        """Newest first; what is not ours is not among them."""
+        return [path for path in checkpoints_in(self.save_path, self.name_prefix) if is_whole(path)]
 
     def _delete_old(self) -> None:
-        """Only what is ours, and none that is needed in the place of a damaged one."""
-        whole = [path for path in checkpoints_in(self.save_path, self.name_prefix) if is_whole(path)]
-        for path in whole[self.keep :]:
-            path.unlink()
+        """None that is needed in the place of a damaged one."""
+        for path in self._whole_checkpoints()[self.keep :]:
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                warnings.warn(f"The old checkpoint {path} could not be deleted, and stays: {error}", stacklevel=3)
 
     def _end_if_asked(self) -> None:
         if (number := self._signals.pending) is None:

@@ -1,5 +1,5 @@
 """
-Checkpoint files: written so that none is ever half there, sealed by a checksum, and found again.
+Checkpoint files: sealed by a checksum, and found again.
 
 A checkpoint is a model as SB3 saves it with one member more, the state of the training, and with a comment that is the
 SHA-256 of everything before it. SB3 and rl-zoo3 load it as a model.
@@ -62,27 +62,6 @@ def state_in(content: bytes) -> bytes:
     """
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         return archive.read(_STATE)
-
-
-def write_atomically(path: Path, content: bytes, temporary: Path) -> None:
-    """
-    After a crash at any moment there is the new file, or what was there before.
-
-    :param path: of the file
-    :param content: of the file
-    :param temporary: a name in the same folder, for the time of writing
-    :raises OSError: if it cannot be written; what was there before is still there
-    """
-    try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
-    _sync_folder(path.parent)
 
 
 def checkpoint_path(folder: Path, name_prefix: str, num_timesteps: int) -> Path:
@@ -152,14 +131,3 @@ def newest_checkpoint(path: str | os.PathLike[str]) -> tuple[Path, bytes]:
 
 def _digest(content: bytes) -> bytes:
     return hashlib.sha256(content).hexdigest().encode()
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a new name last, where the system can be asked to."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -3,9 +3,11 @@
 import json
 import os
 import re
+from numbers import Real
 from pathlib import Path
 from typing import Any, Self, cast
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -13,8 +15,8 @@ from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import GymEnv
 from torch import nn
 
-from sb3_gae.checks import check_choice
-from sb3_gae.saving.checkpoint_file import write_atomically
+from sb3_gae.checks import check_choice, check_number
+from sb3_gae.saving.atomic_write import write_atomically
 from sb3_gae.saving.weights_file import WeightsFile, read_weights, weights_content
 
 _SETTINGS = (
@@ -23,7 +25,7 @@ _SETTINGS = (
     *("vf_trust_region", "vf_steps", "vf_cg_max_steps", "vf_cg_damping", "vf_kl_fraction", "vf_optimizer"),
     *("normalize_value", "curvature_samples", "n_episodes", "baseline", "value_fit_first", "use_sde", "sde_sample_freq"),
 )
-_OF_ADAM = ("batch_size", "n_critic_updates")
+_OF_ADAM = ("learning_rate", "batch_size", "n_critic_updates")
 _FLAGS = ("ortho_init", "full_std", "use_expln", "squash_output", "share_features_extractor", "normalize_images")
 _ACTIVATIONS = {kind.__name__: kind for kind in (nn.Tanh, nn.ReLU, nn.ELU, nn.LeakyReLU, nn.SiLU, nn.GELU, nn.Sigmoid)}
 
@@ -44,8 +46,9 @@ class PortableModel(OnPolicyAlgorithm):
                 f"{self.policy_class.__name__} is no policy of {type(self).__name__} with a name; use `save` for policies of "
                 "your own."
             )
-        settings = {name: getattr(self, name) for name in (*_SETTINGS, *_OF_ADAM)}
+        settings = {name: _plain(getattr(self, name)) for name in (*_SETTINGS, *_OF_ADAM)}
         settings |= {"policy": aliases[0], "policy_kwargs": _written_policy_kwargs(self.policy_kwargs)}
+        settings["learning_rate"] = _written_learning_rate(settings["learning_rate"], settings["vf_optimizer"])
         place = Path(path)
         write_atomically(place, weights_content(self.policy.state_dict(), settings), place.with_name(f".{place.name}.tmp"))
 
@@ -59,10 +62,12 @@ class PortableModel(OnPolicyAlgorithm):
         :param path: written by :meth:`save_weights`, or by ``save``: of that file what is plain is read
         :param env: with the spaces of the model
         :param device: on which to run
-        :param kwargs: arguments of the algorithm, in place of those in the file. ``policy`` and ``policy_kwargs`` are needed
-            where a file of ``save`` has others than the defaults, as far as these are pickled there
+        :param kwargs: arguments of the algorithm, in place of those in the file. ``policy``, ``policy_kwargs`` and
+            ``learning_rate`` are needed where a file of ``save`` has others than the defaults, as far as these are pickled
+            there, as every schedule is
         :return: the model; its optimiser begins anew
         :raises ValueError: if the file is damaged, or does not fit
+        :raises TypeError: if an argument in ``kwargs`` is unknown
         """
         file = read_weights(Path(path).read_bytes())
         arguments = _checked_arguments(cls, file) | kwargs
@@ -72,7 +77,11 @@ class PortableModel(OnPolicyAlgorithm):
         try:
             model = cls(policy or _policy_for(env), env, device=device, **arguments)
         except (MemoryError, TypeError, AssertionError, OverflowError) as error:
-            raise ValueError(f"The settings in {path} make no model: {error}") from error
+            if any(f"unexpected keyword argument {name!r}" in str(error) for name in kwargs):
+                # It says what is wrong, and the file is not at fault: of its settings only known ones are taken
+                raise
+            own = f" with your {', '.join(map(repr, kwargs))}" if kwargs else ""
+            raise ValueError(f"The settings in {path}{own} make no model: {error}") from error
         try:
             model.policy.load_state_dict(file.tensors)
         except RuntimeError as error:
@@ -81,11 +90,32 @@ class PortableModel(OnPolicyAlgorithm):
 
 
 def _written_policy_kwargs(policy_kwargs: dict[str, Any]) -> dict[str, Any]:
-    written = dict(policy_kwargs)
+    written = _plain(policy_kwargs)
     if (activation := written.get("activation_fn")) is not None:
         written["activation_fn"] = getattr(activation, "__name__", repr(activation))
     _read_policy_kwargs(json.loads(json.dumps(written, default=repr)))
     return written
+
+
+def _written_learning_rate(learning_rate: Any, vf_optimizer: str) -> float | None:
+    if isinstance(learning_rate, Real):
+        return float(learning_rate)
+    if vf_optimizer == "adam":
+        raise ValueError(
+            "`learning_rate` is a schedule, which cannot be kept without pickle; use `save` and `load`, or set "
+            "`model.learning_rate` to a number."
+        )
+    # It has no effect
+    return None
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of NumPy as those of Python, which JSON can write."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return {name: _plain(part) for name, part in value.items()}
+    return [_plain(part) for part in value] if isinstance(value, list | tuple) else value
 
 
 def _checked_arguments(cls: type[OnPolicyAlgorithm], file: WeightsFile) -> dict[str, Any]:
@@ -96,6 +126,9 @@ def _checked_arguments(cls: type[OnPolicyAlgorithm], file: WeightsFile) -> dict[
         value = file.settings.get(name)
         if value is not None and isinstance(value, bool | int | float | str):
             arguments[name] = value
+    if "learning_rate" in arguments:
+        # The constructor hands it to torch as it is
+        check_number("learning_rate", arguments["learning_rate"], 0.0, below=True)
     if isinstance(arguments.get("gae_lambda"), str):
         raise ValueError("`gae_lambda` in the file must be a number.")
     if (policy := file.settings.get("policy")) is not None:

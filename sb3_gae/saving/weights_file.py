@@ -70,7 +70,7 @@ def read_weights(content: bytes) -> WeightsFile:
     except ValueError:
         raise
     # Whatever a parser makes of a hostile file
-    except (Exception, RecursionError) as error:
+    except Exception as error:
         raise ValueError(f"The file is damaged, or holds no weights: {type(error).__name__}: {error}") from error
 
 

@@ -6,7 +6,7 @@ from typing import Any
 from rl_zoo3.utils import StoreDict
 
 from sb3_gae.sweep.conditions import CONDITIONS
-from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.errors import SweepError, in_one_line
 from sb3_gae.sweep.figures import KINDS
 from sb3_gae.sweep.liveness import SILENT_AFTER
 from sb3_gae.sweep.presets import PRESETS
@@ -34,7 +34,7 @@ class _StoreParams(StoreDict):
             try:
                 super().__call__(parser, namespace, [value], option_string)
             except Exception as error:
-                what = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+                what = f"{type(error).__name__}: {in_one_line(error)}"
                 raise SweepError(
                     f"`-params {name}` must be a value in Python, got {text} ({what}); a text needs quotes of its own, "
                     f"as in -params \"{name}:'{text}'\"."

@@ -53,7 +53,8 @@ def _from_finished(task: str, left: Sequence[Cell], table: dict[str, Standing]) 
         return None
     chunks = [chunk["seconds"] for stored in done for name, chunk in stored.items() if name.startswith("rows:")]
     iterations = sum(map(len, chunks))
-    setup = sum(stored.get("setup_seconds", 0.0) for stored in done) / len(done)
+    # None where a cell was imported that had none
+    setup = sum(stored.get("setup_seconds") or 0.0 for stored in done) / len(done)
     each = sum(map(sum, chunks)) / iterations
     n_iterations = sum(cell.iterations for cell in left)
     seconds = each * n_iterations + setup * len(left)

@@ -22,10 +22,15 @@ class _Manager(ExperimentManager):
     """rl-zoo3's, without files: neither monitors nor a folder of settings for each of a thousand runs."""
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> Any:
-        # Known only once the settings are read; others than batched environments have no threads to set
-        if getattr(self, "batched_envs", False):
-            self.vec_env_kwargs = {**self.vec_env_kwargs, "n_threads": self.args.threads}
+        self.vec_env_kwargs = self.vec_env_kwargs | self._threads()
         return super().create_envs(n_envs, eval_env, no_log=True)
+
+    def _threads(self) -> dict[str, int]:
+        """Known only once the settings are read."""
+        if getattr(self, "rollout_workers", None) is not None:
+            return {"cpus_per_worker": self.args.threads}
+        # Others have no threads to set
+        return {"n_threads": self.args.threads} if getattr(self, "batched_envs", False) else {}
 
     def create_log_folder(self) -> None:
         pass

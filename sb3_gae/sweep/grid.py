@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 
 from sb3_gae.checks import check_count, check_number
 from sb3_gae.sweep.conditions import find_condition
-from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.errors import SweepError, checks
 
 
 @dataclass(frozen=True)
@@ -36,14 +36,12 @@ class Cell:
 
     def __post_init__(self) -> None:
         uses_lambda = find_condition(self.condition).uses_lambda
-        try:
+        with checks():
             check_number("gamma", self.gamma, 0.0, 1.0)
             if uses_lambda:
                 check_number("gae_lambda", self.gae_lambda, 0.0, 1.0)
             check_count("seeds", self.seed, low=0)
             check_count("iterations", self.iterations)
-        except ValueError as error:
-            raise SweepError(str(error)) from None
         # 0 and 0.0 are one cell, and so are all λ where λ has no meaning
         object.__setattr__(self, "gamma", float(self.gamma))
         object.__setattr__(self, "gae_lambda", float(self.gae_lambda) if uses_lambda else None)  # type: ignore[arg-type]
@@ -67,9 +65,14 @@ class Cell:
         own = {"gamma": self.gamma} | ({} if self.gae_lambda is None else {"gae_lambda": self.gae_lambda})
         return json.loads(self.overrides) | dict(find_condition(self.condition).settings) | own
 
-    def __str__(self) -> str:
+    @property
+    def label(self) -> str:
+        """Its curve in words."""
         of_lambda = "" if self.gae_lambda is None else f", λ = {self.gae_lambda:g}"
-        return f"{self.task}, {self.condition}, γ = {self.gamma:g}{of_lambda}, seed {self.seed}, {self.iterations} iterations"
+        return f"{self.task}, {self.condition}, γ = {self.gamma:g}{of_lambda}"
+
+    def __str__(self) -> str:
+        return f"{self.label}, seed {self.seed}, {self.iterations} iterations"
 
 
 class Curve(NamedTuple):

@@ -31,7 +31,14 @@ def sign_of_life() -> dict[str, Any]:
     """
     :return: who and when, to be stored with a running cell; times in seconds since 1970
     """
-    return {"host": socket.gethostname(), "pid": os.getpid(), "started": _start_of(os.getpid()), "time": time.time()}
+    pid = os.getpid()
+    return {
+        "host": socket.gethostname(),
+        "pid": pid,
+        "pid_namespace": _pid_namespace(),
+        "started": _start_of(pid),
+        "time": time.time(),
+    }
 
 
 def why_dead(sign: Mapping[str, Any], now: float, silent_after: float = SILENT_AFTER) -> str | None:
@@ -42,10 +49,25 @@ def why_dead(sign: Mapping[str, Any], now: float, silent_after: float = SILENT_A
     :return: why its process counts as gone, None if it does not
     """
     who = f"process {sign['pid']} on {sign['host']}"
-    if sign["host"] == socket.gethostname() and not _lives(int(sign["pid"]), sign.get("started")):
+    if _is_visible(sign) and not _lives(int(sign["pid"]), sign.get("started")):
         return f"{who} ended without a word"
     silence = now - float(sign["time"])
     return f"{who} gave no sign of life for {silence:.0f} s" if silence > silent_after else None
+
+
+def _is_visible(sign: Mapping[str, Any]) -> bool:
+    """Whether the number of its process means here what it meant there: containers may have the same host name."""
+    here = _pid_namespace()
+    # Those of earlier versions have none
+    return sign["host"] == socket.gethostname() and sign.get("pid_namespace", here) == here
+
+
+def _pid_namespace() -> int | None:
+    """What tells sets of process numbers apart on one machine; None where the system does not tell."""
+    try:
+        return Path("/proc/self/ns/pid").stat().st_ino
+    except OSError:
+        return None
 
 
 def _lives(pid: int, started: int | None) -> bool:

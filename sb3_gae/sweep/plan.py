@@ -4,8 +4,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from sb3_gae.checks import check_count
 from sb3_gae.sweep.conditions import find_condition
-from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.errors import SweepError, checks
 from sb3_gae.sweep.grid import Cell, Curve, cells_of, product
 from sb3_gae.sweep.liveness import SILENT_AFTER
 from sb3_gae.sweep.presets import find_preset
@@ -100,8 +101,8 @@ def check_seeds(count: int) -> int:
     :return: the same
     :raises SweepError: if there is not at least one
     """
-    if count < 1:
-        raise SweepError(f"`seeds` must be at least 1, got {count}.")
+    with checks():
+        check_count("seeds", count)
     return count
 
 

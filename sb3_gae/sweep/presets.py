@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from sb3_gae.callbacks import PAPER_LAMBDAS
+from sb3_gae.presets import PAPER_LAMBDAS
 from sb3_gae.sweep.conditions import did_you_mean
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.grid import Curve, product

@@ -71,7 +71,8 @@ class Recorder(BaseCallback):
             "episodes": len(self._returns),
             "mean_return": float(np.mean(self._returns)) if self._returns else math.nan,
             "mean_length": float(np.mean(self._lengths)) if self._lengths else math.nan,
-            "lambda_used": float(self.model.gae_lambda),  # type: ignore[attr-defined]
+            # Of the buffer: without a value function that of the model has no effect
+            "lambda_used": float(self.locals["rollout_buffer"].gae_lambda),
         }
 
     def _on_training_end(self) -> None:

@@ -61,9 +61,8 @@ def running(table: dict[str, Standing]) -> str:
 
 
 def _curve_of(cell: Cell) -> str:
-    of_lambda = "" if cell.gae_lambda is None else f", λ = {cell.gae_lambda:g}"
     overrides = "" if cell.overrides == "{}" else f", {cell.overrides}"
-    return f"{cell.task}, {cell.condition}, γ = {cell.gamma:g}{of_lambda}, {cell.iterations} iterations{overrides}"
+    return f"{cell.label}, {cell.iterations} iterations{overrides}"
 
 
 def _named(key: str) -> str:

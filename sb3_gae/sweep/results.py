@@ -1,6 +1,7 @@
 """Results as a table: a row for each iteration of each finished cell, from a study or from an exported file."""
 
 import json
+import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import pandas as pd
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_gae.sweep.agreement import check_alike, made_in
-from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.errors import SweepError, in_one_line
 from sb3_gae.sweep.grid import Cell
 from sb3_gae.sweep.ledger import Outcome, Status, standings
 from sb3_gae.sweep.provenance import PROVENANCE_COLUMNS
@@ -74,13 +75,25 @@ def read_results(path: str | Path, *, partial: bool = False) -> pd.DataFrame:
     """
     path = Path(path)
     try:
-        table = read_parquet(path) if is_parquet(path) else _read_csv(path)
+        table = _checked(read_parquet(path) if is_parquet(path) else _read_csv(path), path)
     except FileNotFoundError:
         raise SweepError(f"There is no results file {path}; make it with: python -m sb3_gae.sweep export") from None
-    except (OSError, ValueError, pd.errors.ParserError) as error:
-        if isinstance(error, SweepError):
-            raise
-        raise SweepError(f"{path} cannot be read as a results file ({' '.join(str(error).split())[:200]}).") from error
+    except SweepError:
+        raise
+    except (OSError, ValueError, EOFError, zlib.error) as error:
+        raise SweepError(f"{path} cannot be read as a results file ({in_one_line(error)}).") from error
+    check_runs(finished(table), str(path))
+    return table if partial else finished(table)
+
+
+def _checked(table: pd.DataFrame, path: Path) -> pd.DataFrame:
+    """
+    :param table: as it was read
+    :param path: it was read from, for messages
+    :return: the same, with the columns of :data:`~sb3_gae.sweep.results.COLUMNS`
+    :raises SweepError: if it is something else, or another version wrote it
+    :raises ValueError: if values are missing, or of the wrong type
+    """
     if "format" not in table or "sweep" not in table:
         raise SweepError(f"{path} is not a results file of a sweep; make one with: python -m sb3_gae.sweep export")
     versions = sorted(set(table["format"]))
@@ -89,9 +102,7 @@ def read_results(path: str | Path, *, partial: bool = False) -> pd.DataFrame:
         raise SweepError(f"{path} is of format {written}, and this sb3-gae knows {FORMAT}; export it anew from its storage.")
     if missing := [name for name in COLUMNS if name not in table]:
         raise SweepError(f"{path} lacks the columns {', '.join(missing)}; export it anew from its storage.")
-    table = _typed(table)
-    check_runs(finished(table), str(path))
-    return table if partial else finished(table)
+    return _typed(table)
 
 
 def _read_csv(path: Path) -> pd.DataFrame:
@@ -162,12 +173,14 @@ def select(
     for column, values in wanted.items():
         if values is None:
             continue
-        kept = table[column].isin(list(values))
+        chosen = list(values)
+        kept = table[column].isin(chosen)
+        if not kept.any():
+            held = sorted(table[column].dropna().unique())
+            there = f"there are {_listed(held)}" if held else "there is none"
+            raise SweepError(f"The selection is empty: no finished cell has {column} {_listed(chosen)}; {there}.")
         if column == "gae_lambda":
             kept |= table[column].isna()
-        if not kept.any():
-            held = ", ".join(_shown(value) for value in sorted(table[column].dropna().unique()))
-            raise SweepError(f"The selection is empty: no finished cell has {column} {_listed(values)}; there are {held}.")
         table = table[kept]
     for column, option in {
         "task": "--env",

@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from sb3_gae.sweep.errors import SweepError
@@ -24,6 +25,8 @@ from sb3_gae.sweep.worker import StopRequest, work, work_as_process
 _LOOK_EVERY = 2.0
 #: seconds for processes that were asked to stop
 _PATIENCE = 60.0
+#: processes that may be killed one after another before they have a cell
+_MAX_KILLED = 3
 
 
 def check_plan(plan: Plan) -> dict[str, dict[str, Any]]:
@@ -140,6 +143,19 @@ def _without_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+@dataclass(frozen=True, eq=False)
+class _Worker:
+    """
+    :param process: runs cells
+    :param has_claimed: a number that it shares, 1 once it has had a cell
+    :param n_killed: processes in its place, one after another, that were killed before they had one
+    """
+
+    process: Any
+    has_claimed: Any
+    n_killed: int
+
+
 class _Pool:
     """
     Processes that each run one cell after another.
@@ -155,31 +171,43 @@ class _Pool:
         self._messages = self._context.Queue()
         self._workers = [self._start() for _ in range(min(jobs, len(plan.cells)))]
 
-    def _start(self) -> Any:
-        process = self._context.Process(target=work_as_process, args=(self._plan, self._messages), daemon=True)
+    def _start(self, n_killed: int = 0) -> _Worker:
+        # Without a lock, which a process that is killed could keep
+        has_claimed = self._context.RawValue("b", 0)
+        process = self._context.Process(target=work_as_process, args=(self._plan, self._messages, has_claimed), daemon=True)
         with _without_interrupts():
             process.start()
-        return process
+        return _Worker(process, has_claimed, n_killed)
 
     def run(self, stop: StopRequest, bar: Progress) -> None:
         try:
             while self._workers and not stop.is_set():
                 time.sleep(0.2)
-                self._workers = [again for worker in self._workers if (again := self._look_after(worker)) is not None]
+                for worker in list(self._workers):
+                    self._look_after(worker)
                 bar.show_now_and_then(_LOOK_EVERY)
         finally:
             self._end()
 
-    def _look_after(self, worker: Any) -> Any:
-        """:return: the process itself, its successor if it was killed, None if it had nothing left to do"""
-        if worker.is_alive():
-            return worker
-        worker.join()
-        if worker.exitcode == 0:
-            return None
-        if worker.exitcode < 0:
+    def _look_after(self, worker: _Worker) -> None:
+        """Take out a worker that has ended, and put another in the place of one that was killed."""
+        if worker.process.is_alive():
+            return
+        worker.process.join()
+        self._workers.remove(worker)
+        status = worker.process.exitcode
+        if status == 0:
+            return
+        if status < 0:
             # Its cell is given up and asked for again, but not for ever, when the next one claims
-            return self._start()
+            n_killed = 0 if worker.has_claimed.value else worker.n_killed + 1
+            if n_killed == _MAX_KILLED:
+                raise SweepError(
+                    f"`jobs`: {n_killed} processes in a row were killed by signal {-status} before they had a cell. "
+                    "If memory is short, use fewer. What is done is kept: the same command goes on from there."
+                )
+            self._workers.append(self._start(n_killed))
+            return
         raise SweepError(self._message() or "A process of the sweep ended with an error, which is printed above.")
 
     def _message(self) -> str:
@@ -190,12 +218,13 @@ class _Pool:
 
     def _end(self) -> None:
         """Ask all that are left to stop, and wait until they have stored how far they were."""
-        for worker in self._workers:
-            if worker.is_alive():
-                worker.terminate()
+        processes = [worker.process for worker in self._workers]
+        for process in processes:
+            if process.is_alive():
+                process.terminate()
         until = time.monotonic() + _PATIENCE
-        for worker in self._workers:
-            worker.join(max(0.0, until - time.monotonic()))
-            if worker.is_alive():
-                worker.kill()
-                worker.join()
+        for process in processes:
+            process.join(max(0.0, until - time.monotonic()))
+            if process.is_alive():
+                process.kill()
+                process.join()

@@ -19,8 +19,8 @@ CELL_COLUMNS = ("task", "condition", "gamma", "gae_lambda", "seed", "iterations"
 STATE_COLUMN = "state"
 # The number of a trial names a run only within its sweep, and two machines may give both the same name
 _RUN_COLUMNS = [*CELL_COLUMNS, "sweep", "trial"]
-# What a run that is made again has in common with the first
-_RESULT_COLUMNS = [name for name in ROW_COLUMNS if name != "seconds"]
+# What a run that is made again has in common with the first. Older files say of `no_vf` the λ that it did not use
+_RESULT_COLUMNS = [name for name in ROW_COLUMNS if name not in ("seconds", "lambda_used")]
 
 
 def cell_of(row: Any) -> Cell:
@@ -86,7 +86,7 @@ def combine(tables: Iterable[tuple[str, pd.DataFrame]]) -> pd.DataFrame:
             cell = cell_of(run.iloc[0])
             before, first = seen.setdefault(cell.key, (name, run))
             if first is not run and not _have_same_results(first, run):
-                of_cell = f"seed {cell.seed} of {', '.join(part for part in str(cell).split(', ') if 'seed' not in part)}"
+                of_cell = f"seed {cell.seed} of {cell.label}, {cell.iterations} iterations"
                 where = f"both {before} and {name}" if before != name else f"{name} twice"
                 raise SweepError(f"{of_cell} is in {where} with different results; leave out one of them.")
     runs = [run for _, run in seen.values()]

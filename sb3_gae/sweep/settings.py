@@ -16,7 +16,7 @@ import yaml
 
 import sb3_gae.zoo
 from sb3_gae.sweep.conditions import did_you_mean, find_condition
-from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.errors import SweepError, in_one_line
 from sb3_gae.sweep.grid import Cell
 from sb3_gae.trpo_gae import TRPOGAE
 
@@ -52,15 +52,11 @@ def import_packages(gym_packages: Iterable[str]) -> None:
             importlib.import_module(name)
         except ImportError as error:
             raise SweepError(
-                f"`gym_packages`: {name} cannot be imported ({_in_one_line(error)}); run where it lies, or install it."
+                f"`gym_packages`: {name} cannot be imported ({in_one_line(error)}); run where it lies, or install it."
             ) from error
         except Exception as error:
-            what = f"{type(error).__name__}: {_in_one_line(error)}"
+            what = f"{type(error).__name__}: {in_one_line(error)}"
             raise SweepError(f"`gym_packages`: {name} fails when it is imported ({what}); mend it first.") from error
-
-
-def _in_one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
 
 
 def check_tasks(tasks: Iterable[str]) -> None:
@@ -107,7 +103,7 @@ def shipped_settings(task: str, conf_file: str | None = None) -> dict[str, Any]:
         with contextlib.redirect_stdout(io.StringIO()):
             _, settings = manager.read_hyperparameters()
     except (OSError, ValueError, ImportError, KeyError, yaml.YAMLError) as error:
-        what = " ".join(str(error).split())
+        what = in_one_line(error, longest=None)
         raise SweepError(f"`conf_file`: no settings of {task} in {conf_file or 'the shipped file'} ({what}).") from error
     return as_json(settings)
 

@@ -22,7 +22,7 @@ from sqlalchemy.exc import (
     SQLAlchemyError,
 )
 
-from sb3_gae.sweep.errors import SweepError, UnreachableError
+from sb3_gae.sweep.errors import SweepError, UnreachableError, in_one_line
 from sb3_gae.sweep.location import is_server, is_url, parse_url, without_password
 
 #: seconds that a process waits for another one's write
@@ -236,7 +236,7 @@ def _cause_of(error: BaseException) -> BaseException:
 def _explain(location: str, error: Exception) -> str:
     where, cause = without_password(location), _cause_of(error)
     said = cause.orig if isinstance(cause, DBAPIError) and cause.orig is not None else cause
-    what = (" ".join(str(said).split()) or type(said).__name__)[:200].rstrip(".?")
+    what = (in_one_line(said) or type(said).__name__).rstrip(".?")
     if "locked" in what and not is_server(location):
         return f"The storage {where} is locked by another program; wait for it, or pass another --storage. ({what})"
     if isinstance(error, ImportError):

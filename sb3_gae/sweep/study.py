@@ -206,13 +206,38 @@ class SweepStudy:
             standing = table.get(cell.key)
             if standing is None or standing.status != Status.WAITING or standing.trial is None:
                 continue
-            trial_id = self._id_of(standing.trial)
-            try:
-                if self.ask(self.storage.set_trial_state_values, trial_id, TrialState.RUNNING):
-                    return Claim(self, cell, trial_id)
-            except (UpdateFinishedTrialError, TakenOverError):
-                continue
+            if (claim := self._take(cell, standing.trial)) is not None:
+                return claim
         return None
+
+    def _take(self, cell: Cell, trial: FrozenTrial) -> "Claim | None":
+        """
+        :param cell: that waits
+        :param trial: of it
+        :return: None if another process was first
+        """
+        trial_id, n_attempts = self._id_of(trial), 0
+
+        def take() -> bool:
+            nonlocal n_attempts
+            n_attempts += 1
+            return self.storage.set_trial_state_values(trial_id, TrialState.RUNNING)
+
+        try:
+            if self.ask(take):
+                return Claim(self, cell, trial_id)
+        except (UpdateFinishedTrialError, TakenOverError):
+            return None
+        # An attempt that was cut off may have taken it without a word, and then nobody would run it
+        if n_attempts == 1 or not self._is_taken_without_a_sign(trial_id):
+            return None
+        # Given back, not kept: if it is another's, who has not signed yet, that one is told so before it begins
+        self._end(trial, Outcome.STOPPED, "the storage was cut off while it was taken")
+        return self.claim([cell])
+
+    def _is_taken_without_a_sign(self, trial_id: int) -> bool:
+        trial = self.ask(self.storage.get_trial, trial_id)
+        return trial.state == TrialState.RUNNING and "sign_of_life" not in trial.user_attrs
 
     def renew(self, cells: Iterable[Cell]) -> dict[str, Standing]:
         """

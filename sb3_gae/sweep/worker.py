@@ -9,12 +9,13 @@ import signal
 import time
 import traceback
 import warnings
+from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
 import torch as th
 
-from sb3_gae.sweep.errors import SweepError
+from sb3_gae.sweep.errors import SweepError, in_one_line
 from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.ledger import Outcome
 from sb3_gae.sweep.liveness import patience_with
@@ -70,13 +71,14 @@ class StopRequest:
         return bool(self.reason)
 
 
-def work(plan: Plan, stop: StopRequest, patience: Patience) -> None:
+def work(plan: Plan, stop: StopRequest, patience: Patience, on_claim: Callable[[], None] = lambda: None) -> None:
     """
     Run cells until none waits.
 
     :param plan: what to run
     :param stop: asked at every step
     :param patience: with a storage that does not answer
+    :param on_claim: called before each cell
     :raises SweepError: if the storage cannot be used any more
     """
     n_threads = th.get_num_threads()
@@ -85,6 +87,7 @@ def work(plan: Plan, stop: StopRequest, patience: Patience) -> None:
         # The sweep has begun: that its storage does not answer may pass
         study = patience(lambda: SweepStudy(plan.name, plan.location, silent_after=plan.silent_after, patience=patience))
         while not stop.is_set() and (claim := study.claim(plan.cells)) is not None:
+            on_claim()
             start = time.monotonic()
             run_claim(claim, plan.options, stop)
             if time.monotonic() - start > _LONG_CELL:
@@ -104,18 +107,23 @@ def return_freed_memory() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def work_as_process(plan: Plan, messages: Any) -> None:
+def work_as_process(plan: Plan, messages: Any, has_claimed: Any) -> None:
     """
     :func:`work` in a process of its own.
 
     :param plan: what to run
     :param messages: a queue for the one line to print if it cannot go on
+    :param has_claimed: a shared number without a lock, which becomes 1 with the first cell
     """
     stop = StopRequest()
     stop.listen()
+
+    def on_claim() -> None:
+        has_claimed.value = 1
+
     try:
         import_packages(plan.options.gym_packages)
-        work(plan, stop, Patience(patience_with(plan.silent_after), stop.is_set))
+        work(plan, stop, Patience(patience_with(plan.silent_after), stop.is_set), on_claim)
     except SweepError as error:
         messages.put(str(error))
         raise SystemExit(2) from None
@@ -150,7 +158,7 @@ def run_claim(claim: Claim, options: Options, stop: StopRequest) -> None:
     except Exception as error:
         # Its end is the innermost, and a database may have no room for more
         _give_up(
-            claim, curve, Outcome.FAILED, _in_one_line(error), traceback="".join(traceback.format_exception(error))[-20_000:]
+            claim, curve, Outcome.FAILED, _reason_of(error), traceback="".join(traceback.format_exception(error))[-20_000:]
         )
 
 
@@ -163,9 +171,9 @@ def _give_up(claim: Claim, curve: "_CurveWriter", outcome: Outcome, reason: str,
         pass
 
 
-def _in_one_line(error: Exception) -> str:
+def _reason_of(error: Exception) -> str:
     last = traceback.extract_tb(error.__traceback__)[-1]
-    what = " ".join(str(error).split())
+    what = in_one_line(error, longest=None)
     return f"{type(error).__name__}: {what} [{last.name}, {last.filename.rsplit('/', 1)[-1]}:{last.lineno}]"
 
 

@@ -20,7 +20,7 @@ OutputMoments = Mapping[nn.Module, th.Tensor]
 NOTHING_ADDED: OutputMoments = MappingProxyType({})
 
 # Eigendecompositions grow with the cube of a layer's width; above this they cost more than the products that they save
-_WIDEST_LAYER = 512
+WIDEST_LAYER = 512
 
 
 class KroneckerPreconditioner:
@@ -46,7 +46,7 @@ class KroneckerPreconditioner:
         :param network: any
         :return: whether its layers are narrow enough for this to pay
         """
-        return all(max(linear.weight.shape) <= _WIDEST_LAYER for linear, _ in network.layers)
+        return all(max(linear.weight.shape) <= WIDEST_LAYER for linear, _ in network.layers)
 
     @th.no_grad()
     def __call__(self, vector: th.Tensor, scale: float, damping: float) -> th.Tensor:

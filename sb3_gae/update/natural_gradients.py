@@ -15,6 +15,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.networks.dense_policy import has_dense_policy
 from sb3_gae.networks.parameters import positions
+from sb3_gae.update.kronecker import WIDEST_LAYER
 from sb3_gae.update.policy_step import DenseFisher
 
 # Second moments of so many samples are good enough for a metric
@@ -52,7 +53,9 @@ def natural_gradients(
     """
     fisher = _prepared_fisher(policy, parameters, batch)
     if fisher is None:
-        raise ValueError("Natural gradients need a policy that is an MLP as SB3 builds it, with layers no wider than 512.")
+        raise ValueError(
+            f"Natural gradients need a policy that is an MLP as SB3 builds it, with layers no wider than {WIDEST_LAYER}."
+        )
     places = positions(parameters, fisher.parameters).cpu().numpy()
     dtype, device = parameters[0].dtype, parameters[0].device
 
@@ -77,7 +80,7 @@ def has_natural_gradients(policy: ActorCriticPolicy, parameters: Sequence[th.Ten
     :param batch: at least one sample
     :return: whether :func:`natural_gradients` knows this kind of policy
     """
-    one = batch.take(th.zeros(1, dtype=th.long, device=batch.advantages.device))
+    one = batch.first()
     return _prepared_fisher(policy, parameters, one) is not None
 
 

@@ -24,7 +24,7 @@ def policy_parameters(policy: ActorCriticPolicy, batch: TrainingBatch) -> list[t
     :param batch: at least one sample
     :return: the trainable parameters that the action distribution depends on
     """
-    sample = batch.take(th.zeros(1, dtype=th.long, device=batch.advantages.device))
+    sample = batch.first()
     log_prob = policy.get_distribution(sample.observations).log_prob(sample.actions)
     return influencing_parameters(log_prob, policy.parameters())
 
@@ -50,7 +50,7 @@ def policy_step(
     :return: what was done
     :raises NumericalError: if the gradient or a curvature product is not finite
     """
-    curvature_batch = batch if curvature_subset is None else batch.take(curvature_subset)
+    curvature_batch = batch.take(curvature_subset)
     make_problem = _dense_problem if has_dense_policy(policy, parameters) else _autograd_problem
     return trust_region_step(make_problem(policy, parameters, batch, advantages, curvature_batch), settings)
 

@@ -22,7 +22,7 @@ from sb3_gae.networks.parameters import flat_gradient, influencing_parameters
 from sb3_gae.networks.value_head import ValueHead
 from sb3_gae.update.curvature import CurvatureProduct, hessian_product
 from sb3_gae.update.kronecker import NOTHING_ADDED, KroneckerPreconditioner, OutputMoments
-from sb3_gae.update.shared_features import SharedParameters, SharedStep
+from sb3_gae.update.shared_parameters import SharedParameters, SharedStep
 from sb3_gae.update.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
 
 
@@ -35,7 +35,7 @@ def value_parameters(
     :param policy_parameters: what the action distribution depends on, which the value step must not move
     :return: the other trainable parameters that the value depends on
     """
-    sample = batch.take(th.zeros(1, dtype=th.long, device=batch.advantages.device))
+    sample = batch.first()
     found = influencing_parameters(policy.predict_values(sample.observations), policy.parameters())
     shared = {id(parameter) for parameter in policy_parameters}
     return [parameter for parameter in found if id(parameter) not in shared]

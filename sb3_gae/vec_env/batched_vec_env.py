@@ -12,6 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from sb3_gae.checks import check_count
 from sb3_gae.vec_env.monitoring import record_episode
 from sb3_gae.vec_env.step_infos import StepInfos
 from sb3_gae.vec_env.wrappers import find_monitor, refuse_foreign_wrapper, time_limit
@@ -39,7 +40,7 @@ class BatchedVecEnv(VecEnv):
     :param observation_space: of one environment
     :param action_space: of one environment
     :param n_threads: that step the physics; None for as many as there are cores
-    :raises ValueError: if ``n_threads`` is less than 1
+    :raises ValueError: if ``n_threads`` is no whole number of at least 1
     """
 
     def __init__(
@@ -49,8 +50,8 @@ class BatchedVecEnv(VecEnv):
         action_space: spaces.Space,
         n_threads: int | None,
     ):
-        if n_threads is not None and n_threads < 1:
-            raise ValueError(f"`n_threads` must be at least 1 or None, got {n_threads}.")
+        if n_threads is not None:
+            check_count("n_threads", n_threads)
         self.envs = list(envs)
         self._was_reset = False
         super().__init__(len(self.envs), observation_space, action_space)

@@ -18,7 +18,10 @@ def batched_vec_env(env_fns: Sequence[Callable[[], gym.Env]], n_threads: int | N
     :param n_threads: that step a batch; None for as many as there are cores. ``DummyVecEnv`` has one whatever it is
     :param kwargs: passed on
     :return: :class:`MujocoVecEnv` or :class:`EnvPoolVecEnv` if one of them can step all, else SB3's ``DummyVecEnv``
+    :raises ValueError: if there is no environment to make
     """
+    if not env_fns:
+        raise ValueError("`env_fns` must make at least one environment.")
     envs = [make() for make in env_fns]
     vec_env_class: Callable[..., VecEnv] = DummyVecEnv
     if all(can_batch(env) for env in envs) and have_common_task(envs):

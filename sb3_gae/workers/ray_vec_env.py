@@ -22,7 +22,7 @@ from sb3_gae.vec_env.choice import batched_vec_env
 from sb3_gae.workers.crew import Crew
 from sb3_gae.workers.rollout_worker import ShareOrder, portable_policy, weights_of
 from sb3_gae.workers.share import Share, batch_steps, joined
-from sb3_gae.workers.wrappers import learn_from_shares, normalizer_of, wrappers_around, wrappers_to_send
+from sb3_gae.workers.wrappers import SentWrapper, learn_from_shares, normalizer_of, wrappers_around, wrappers_to_send
 
 
 class CollectionRecord(NamedTuple):
@@ -141,7 +141,7 @@ class RayVecEnv(VecEnv):
             learn_from_shares(normalize, shares)
 
     def _collect_shares(
-        self, policy: ActorCriticPolicy, plan: RolloutPlan, wrappers: list[bytes | None], with_moments: bool
+        self, policy: ActorCriticPolicy, plan: RolloutPlan, wrappers: list[SentWrapper], with_moments: bool
     ) -> list[Share]:
         start = time.perf_counter()
         before = th.get_rng_state()

@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize, is_vecenv_wra
 from sb3_gae.rollout.collection import Observations, RolloutPlan
 from sb3_gae.saving.environment_state import EnvironmentState, environment_state, restore_environment
 from sb3_gae.workers.share import Share, collect_share
-from sb3_gae.workers.wrappers import ObservationWatch, seen_through, wrap
+from sb3_gae.workers.wrappers import ObservationWatch, SentWrapper, seen_through, wrap
 
 #: parameters and buffers of the policy by name
 Weights = dict[str, np.ndarray]
@@ -37,7 +37,7 @@ class ShareOrder(NamedTuple):
 
     plan: RolloutPlan
     seed: int
-    wrappers: list[bytes | None]
+    wrappers: list[SentWrapper]
     with_moments: bool
     first_env: int
 

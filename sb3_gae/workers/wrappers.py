@@ -24,6 +24,10 @@ from sb3_gae.workers.share import ObservationMoments, Share
 _FEW = 10
 
 
+#: of VecNormalize a pickled copy, of VecTransposeImage whether it leaves images as they are
+SentWrapper = bytes | bool
+
+
 def wrappers_around(env: VecEnv) -> list[VecEnvWrapper]:
     """
     :param env: environments on workers, in their wrappers
@@ -53,23 +57,29 @@ def normalizer_of(wrappers: Sequence[VecEnvWrapper]) -> VecNormalize | None:
     return wrappers[0] if wrappers and isinstance(wrappers[0], VecNormalize) else None
 
 
-def wrappers_to_send(wrappers: Sequence[VecEnvWrapper]) -> list[bytes | None]:
+def wrappers_to_send(wrappers: Sequence[VecEnvWrapper]) -> list[SentWrapper]:
     """
     :param wrappers: what :func:`wrappers_around` found
     :return: what :func:`wrap` makes copies of
     """
-    return [pickle.dumps(_at_rest(wrapper)) if isinstance(wrapper, VecNormalize) else None for wrapper in wrappers]
+    return [_sent(wrapper) for wrapper in wrappers]
 
 
-def wrap(env: VecEnv, sent: Sequence[bytes | None]) -> VecEnv:
+def _sent(wrapper: VecEnvWrapper) -> SentWrapper:
+    if isinstance(wrapper, VecNormalize):
+        return pickle.dumps(_at_rest(wrapper))
+    return bool(cast(VecTransposeImage, wrapper).skip)
+
+
+def wrap(env: VecEnv, sent: Sequence[SentWrapper]) -> VecEnv:
     """
     :param env: of one worker
     :param sent: what :func:`wrappers_to_send` returned
     :return: the environments in copies of the wrappers, which learn nothing
     """
     for content in sent:
-        if content is None:
-            env = VecTransposeImage(env)
+        if isinstance(content, bool):
+            env = VecTransposeImage(env, skip=content)
         else:
             normalize = pickle.loads(content)
             normalize.set_venv(env)

@@ -163,10 +163,11 @@ def trade_off_chart(view: View) -> str:
     places = -np.log(1.0 - 0.99 * view.lambdas) / np.log(100.0)
     value, error = (array[order] for array in view.bias_squared)
     label = "Bias squared and variance for each λ"
-    top = round_up(max(1.0, float(value.max())))
+    value_and_error, variances = value + np.nan_to_num(error), view.variance.value[order]
+    top = round_up(max(1.0, float(value_and_error.max()), float(variances.max())))
     axes = Axes(label, (0.0, 1.0), (0.0, top), x_label="λ from 0 to 1, places by log of the horizon")
     bias = Line(places[order], value, "bias")
-    variance = Line(places[order], view.variance.value[order], "variance")
+    variance = Line(places[order], variances, "variance")
     error = np.nan_to_num(error)
     band = Band(places[order], value - error, value + error, "bias")
     return line_chart(axes, [bias, variance], [float(places[-1])], [band])

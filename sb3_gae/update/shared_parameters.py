@@ -45,7 +45,7 @@ def shared_parameters(
     :param policy_parameters: what the action distribution depends on
     :return: those of them that the value depends on, too
     """
-    sample = batch.take(th.zeros(1, dtype=th.long, device=batch.advantages.device))
+    sample = batch.first()
     return influencing_parameters(policy.predict_values(sample.observations), policy_parameters)
 
 
@@ -109,7 +109,7 @@ class SharedParameters:
         self._policy = policy
         self._is_dense = has_dense_policy(policy, groups.of_policy)
         self._observations = batch.observations
-        self._curvature_batch = batch if curvature_subset is None else batch.take(curvature_subset)
+        self._curvature_batch = batch.take(curvature_subset)
         self._limit = limit
         with th.no_grad():
             self._start = snapshot(policy.get_distribution(self._observations))
