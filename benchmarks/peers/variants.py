@@ -43,6 +43,7 @@ _BEFORE_TUNING = {
     "vf_trust_region": 0.2,
 }
 
+_STD_SMALLER = {"policy_kwargs": "dict(log_std_init=-2)"}
 _STD_1 = {"policy_kwargs": "dict(log_std_init=0)"}
 
 #: settings that were tried on the seeds for tuning
@@ -57,14 +58,19 @@ CANDIDATES = {
         ("kl-.03", "… KL 0.03", {"target_kl": 0.03}),
         ("kl-.03-envs-32", "… KL 0.03, 32 × 64 steps", {"target_kl": 0.03, "n_envs": 32, "n_steps": 64}),
         ("kl-.03-lambda-.9", "… KL 0.03, λ 0.9", {"target_kl": 0.03, "gae_lambda": 0.9}),
+        ("kl-.03-lambda-.8", "… KL 0.03, λ 0.8", {"target_kl": 0.03, "gae_lambda": 0.8}),
         ("kl-.03-gamma-.98", "… KL 0.03, γ 0.98, λ 0.9", {"target_kl": 0.03, "gamma": 0.98, "gae_lambda": 0.9}),
+        ("kl-.03-gamma-.95", "… KL 0.03, γ 0.95, λ 0.9", {"target_kl": 0.03, "gamma": 0.95, "gae_lambda": 0.9}),
         ("kl-.03-curvature-512", "… KL 0.03, curvature on 512 steps", {"target_kl": 0.03, "curvature_samples": 512}),
         ("kl-.05", "… KL 0.05", {"target_kl": 0.05}),
-        ("std-.14", "initial std e⁻²", {"policy_kwargs": "dict(log_std_init=-2)"}),
-        ("std-.14-kl-.03", "initial std e⁻², KL 0.03", {"policy_kwargs": "dict(log_std_init=-2)", "target_kl": 0.03}),
+        ("std-.14", "initial std e⁻²", _STD_SMALLER),
+        ("std-.14-kl-.03", "initial std e⁻², KL 0.03", _STD_SMALLER | {"target_kl": 0.03}),
+        ("std-.14-lambda-.9", "initial std e⁻², λ 0.9", _STD_SMALLER | {"gae_lambda": 0.9}),
+        ("std-.14-kl-.03-lambda-.9", "initial std e⁻², KL 0.03, λ 0.9", _STD_SMALLER | {"target_kl": 0.03, "gae_lambda": 0.9}),
         ("std-.6", "initial std e^-½", {"policy_kwargs": "dict(log_std_init=-0.5)"}),
         ("std-1", "initial std 1", _STD_1),
         ("std-1-kl-.03", "initial std 1, KL 0.03", _STD_1 | {"target_kl": 0.03}),
+        ("std-1-kl-.03-lambda-.9", "initial std 1, KL 0.03, λ 0.9", _STD_1 | {"target_kl": 0.03, "gae_lambda": 0.9}),
         ("std-1-lambda-.9", "initial std 1, λ 0.9", _STD_1 | {"gae_lambda": 0.9}),
         ("std-1-lambda-.98", "initial std 1, λ 0.98", _STD_1 | {"gae_lambda": 0.98}),
         ("std-1-kl-.05", "initial std 1, KL 0.05", _STD_1 | {"target_kl": 0.05}),
