@@ -9,7 +9,8 @@ of the code.
 """
 
 import ast
-from collections.abc import Iterator, Mapping
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -18,8 +19,11 @@ PICTURE = Path(__file__).parent / "images" / "house.svg"
 COMMANDS = "python -m"
 
 Edges = Mapping[str, set[str]]
+#: a room and nothing, or where the arrow from one to another passes a floor
+Node = tuple[str, ...]
 
-WIDTH, ROW, HEIGHT, MARGIN = 132, 84, 34, 14
+WIDTH, ROW, HEIGHT, MARGIN, PASSAGE = 132, 84, 34, 14, 20
+SWEEPS = 8
 STYLE = """
   .room { fill: #fff; stroke: #555; } .file { fill: #f3f3f0; stroke: #999; } text { fill: #222; }
   .arrow { fill: none; stroke: #8a8a8a; } .head { fill: #8a8a8a; }
@@ -94,32 +98,65 @@ def floors(edges: Edges) -> list[list[str]]:
     return found
 
 
-def places(edges: Edges) -> dict[str, tuple[float, float]]:
+def chains(edges: Edges) -> list[list[Node]]:
     """
     :param edges: without a ring
-    :return: the middle of each room's box, in pixels
+    :return: for each import the upper room, the floors that its arrow passes between other rooms, and the lower room
     """
-    rows = floors(edges)
-    widest = max(map(len, rows)) * (WIDTH + MARGIN)
-    found: dict[str, tuple[float, float]] = {}
-    for number, row in enumerate(rows):
-        above = {room: [found[upper][0] for upper in found if room in edges.get(upper, ())] for room in row}
-        row.sort(key=lambda room: (sum(above[room]) / len(above[room]) if above[room] else widest / 2, room))
-        for place, room in enumerate(row):
-            found[room] = (widest * (place + 0.5) / len(row), MARGIN + number * ROW + HEIGHT / 2)
-    return found
+    floor_of = {room: number for number, row in enumerate(floors(edges)) for room in row}
+    return [
+        [(upper, ""), *((upper, lower, str(floor)) for floor in range(floor_of[upper] + 1, floor_of[lower])), (lower, "")]
+        for upper in sorted(edges)
+        for lower in sorted(edges[upper])
+    ]
 
 
-def arrow(upper: tuple[float, float], lower: tuple[float, float]) -> str:
+def places(edges: Edges) -> dict[Node, tuple[float, float]]:
     """
-    :param upper: middle of a box
-    :param lower: middle of the box that the arrow leads to
+    :param edges: without a ring
+    :return: the middle of each room's box, and where arrows pass a floor, in pixels
+    """
+    rows: list[list[Node]] = [[(room, "") for room in row] for row in floors(edges)]
+    steps = [step for chain in chains(edges) for step in itertools.pairwise(chain)]
+    for chain in chains(edges):
+        for node in chain[1:-1]:
+            rows[int(node[2])].append(node)
+    x = {node: float(place) for row in rows for place, node in enumerate(row)}
+    widest = max(sum(map(_room_for, row)) for row in rows)
+    # From the roof to the cellar and back, each time to the middle of the neighbours: few arrows cross then
+    for sweep in range(SWEEPS):
+        ends = sweep % 2
+        for row in rows if ends == 0 else reversed(rows):
+            near = {node: [x[step[ends]] for step in steps if step[1 - ends] == node] for node in row}
+            row.sort(key=lambda node: (sum(near[node]) / len(near[node]) if near[node] else x[node], node))
+            left = (widest - sum(map(_room_for, row))) / 2
+            for node in row:
+                x[node], left = left + _room_for(node) / 2, left + _room_for(node)
+    return {node: (x[node], MARGIN + number * ROW + HEIGHT / 2) for number, row in enumerate(rows) for node in row}
+
+
+def _room_for(node: Node) -> int:
+    return WIDTH + MARGIN if node[1] == "" else PASSAGE
+
+
+def arrow(points: Sequence[tuple[float, float]]) -> str:
+    """
+    :param points: middle of a box, of the gaps to pass, and of the box that the arrow leads to
     :return: as SVG
     """
-    (x, y), (u, v) = upper, lower
-    y, v = y + HEIGHT / 2, v - HEIGHT / 2
-    curve = f"M{x:.0f} {y:.0f}C{x:.0f} {y + 30:.0f} {u:.0f} {v - 30:.0f} {u:.0f} {v:.0f}"
-    return f'<path class="arrow" marker-end="url(#head)" d="{curve}"/>'
+    (x, y), *between, (u, v) = points
+    path = f"M{x:.0f} {y + HEIGHT / 2:.0f}"
+    x, y = x, y + HEIGHT / 2
+    for across, down in between:
+        # Upright past the boxes of that floor
+        for bottom in (down - HEIGHT / 2, down + HEIGHT / 2):
+            path += _bend(x, y, across, bottom)
+            x, y = across, bottom
+    return f'<path class="arrow" marker-end="url(#head)" d="{path}{_bend(x, y, u, v - HEIGHT / 2)}"/>'
+
+
+def _bend(x: float, y: float, u: float, v: float) -> str:
+    return f"C{x:.0f} {(y + v) / 2:.0f} {u:.0f} {(y + v) / 2:.0f} {u:.0f} {v:.0f}"
 
 
 def box(room: str, kind: str, middle: tuple[float, float]) -> str:
@@ -153,8 +190,8 @@ def picture(edges: Edges, folders: set[str]) -> str:
         f"<style>{STYLE}\n</style>",
         '<marker id="head" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" markerHeight="7" orient="auto">'
         '<path class="head" d="M0 0L8 4L0 8z"/></marker>',
-        *(arrow(where[upper], where[lower]) for upper in sorted(few) for lower in sorted(few[upper])),
-        *(box(room, "room" if room in folders else "file", where[room]) for room in sorted(where)),
+        *(arrow([where[node] for node in chain]) for chain in chains(few)),
+        *(box(room, "room" if room in folders else "file", where[room, ""]) for room in sorted(few)),
     ]
     return "\n".join([*lines, "</svg>", ""])
 

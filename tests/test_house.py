@@ -7,7 +7,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "docs"))
 
-from house import COMMANDS, PICTURE, floors, house, rooms, without_shortcuts
+from house import COMMANDS, PICTURE, WIDTH, floors, house, places, rooms, without_shortcuts
 
 
 def test_the_picture_is_that_of_the_imports() -> None:
@@ -28,6 +28,14 @@ def test_arrows_that_follow_from_others_are_left_out() -> None:
     edges = {"door": {"hall", "cellar"}, "hall": {"cellar"}, "cellar": set[str]()}
     assert without_shortcuts(edges) == {"door": {"hall"}, "hall": {"cellar"}, "cellar": set()}
     assert floors(edges) == [["door"], ["hall"], ["cellar"]]
+
+
+def test_no_arrow_passes_behind_a_box() -> None:
+    where = places(without_shortcuts(rooms()))
+    boxes = [place for node, place in where.items() if node[1] == ""]
+    passages = [place for node, place in where.items() if node[1] != ""]
+    assert passages
+    assert all(abs(x - across) > WIDTH / 2 for x, y in boxes for across, down in passages if y == down)
 
 
 def test_a_ring_is_an_error() -> None:
