@@ -15,7 +15,7 @@ class UnreachableError(SweepError):
 @contextlib.contextmanager
 def checks() -> Iterator[None]:
     """
-    A context for the package's checks of arguments, see :mod:`sb3_gae.checks`.
+    A context for the package's checks of arguments, see ``sb3_gae.checks``.
 
     :raises SweepError: in place of a ``ValueError``, with its message
     """
