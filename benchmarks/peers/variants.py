@@ -16,6 +16,9 @@ class Variant(NamedTuple):
     overrides: dict[str, Any]
 
 
+#: sb3-contrib's fit, with the numbers of the zoo
+_ADAM = {"vf_optimizer": "adam", "learning_rate": 1e-3, "batch_size": 128, "n_critic_updates": 20}
+
 VARIANTS = {
     SHIPPED: Variant("as shipped", {}),
     "one-value-step": Variant("one value step a batch, not up to five", {"vf_steps": 1}),
@@ -23,7 +26,7 @@ VARIANTS = {
     "monte-carlo": Variant("Monte-Carlo targets, not λ-returns", {"value_lambda": 1.0}),
     "adam": Variant(
         "the value function fitted by Adam, as sb3-contrib does",
-        {"vf_optimizer": "adam", "learning_rate": 1e-3, "batch_size": 128, "n_critic_updates": 20},
+        _ADAM,
     ),
     "raw-observations": Variant("observations not normalised", {"normalize": False}),
     "raw-advantages": Variant("advantages not standardised", {"normalize_advantage": False}),
@@ -80,6 +83,10 @@ CANDIDATES = {
         ("std-1-lambda-.9", "initial std 1, λ 0.9", _STD_1 | {"gae_lambda": 0.9}),
         ("std-1-lambda-.98", "initial std 1, λ 0.98", _STD_1 | {"gae_lambda": 0.98}),
         ("std-1-kl-.05", "initial std 1, KL 0.05", _STD_1 | {"target_kl": 0.05}),
+        ("std-1-one-value-step", "initial std 1, one value step", _STD_1 | {"vf_steps": 1}),
+        ("std-1-epsilon-.02", "initial std 1, five value steps at ε = 0.02", _STD_1 | {"vf_trust_region": 0.02}),
+        ("std-1-adam", "initial std 1, value function fitted by Adam", _STD_1 | _ADAM),
+        ("std-1-adam-kl-.05", "initial std 1, value function fitted by Adam, KL 0.05", _STD_1 | _ADAM | {"target_kl": 0.05}),
         ("std-1-envs-32", "initial std 1, 32 environments × 64 steps", _STD_1 | {"n_envs": 32, "n_steps": 64}),
         ("std-1-two-envs", "initial std 1, 2 × 1 024 steps", _STD_1 | {"n_envs": 2, "n_steps": 1024}),
         (
