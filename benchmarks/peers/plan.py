@@ -85,11 +85,11 @@ def _ablation() -> Iterator[Cell]:
                 yield Cell(task, OURS, variant, seed, MUJOCO_STEPS)
 
 
-def _tuning() -> Iterator[Cell]:
+def _tuning(steps: int) -> Iterator[Cell]:
     for seed in TUNING_SEEDS:
         for variant in CANDIDATES:
             for task in TUNING_TASKS:
-                yield Cell(task, OURS, variant, seed, TUNING_STEPS)
+                yield Cell(task, OURS, variant, seed, steps)
 
 
 def _mujoco() -> Iterator[Cell]:
@@ -104,6 +104,8 @@ PRESETS: dict[str, tuple[Cell, ...]] = {
     "mujoco": tuple(_mujoco()),
     "mujoco-3m": tuple(_seed_major(dict.fromkeys(PUBLISHED_PPO, LONG_STEPS), {OURS: SEEDS})),
     "ablation": tuple(_ablation()),
-    "tuning": tuple(_tuning()),
+    "tuning": tuple(_tuning(TUNING_STEPS)),
+    # What learns sooner need not end higher
+    "tuning-long": tuple(_tuning(MUJOCO_STEPS)),
     "smoke": tuple(_seed_major({"CartPole-v1": SMOKE_STEPS}, {OURS: 1, TRPO: 1})),
 }

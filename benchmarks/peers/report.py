@@ -24,6 +24,7 @@ _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "three million": tables.long_table,
     "ablation": tables.ablation_table,
     "tuning": tables.tuning_table,
+    "tuning long": tables.long_tuning_table,
     "origin": tables.origin_list,
 }
 #: title of each figure, by the section of the page that it stands in

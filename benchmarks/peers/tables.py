@@ -149,9 +149,21 @@ def tuning_table(table: pd.DataFrame) -> str:
     :param table: of results
     :return: score of each run with settings that were tried, by the seeds for tuning
     """
+    return _tried(table, TUNING_STEPS)
+
+
+def long_tuning_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: the same of runs of the full length
+    """
+    return _tried(table, MUJOCO_STEPS)
+
+
+def _tried(table: pd.DataFrame, steps: int) -> str:
     rows = []
     for variant, about in CANDIDATES.items():
-        own = [runs_of(table, task, OURS, TUNING_STEPS, variant) for task in TUNING_TASKS]
+        own = [runs_of(table, task, OURS, steps, variant) for task in TUNING_TASKS]
         if any(own):
             rows.append([about.title, *(", ".join(number(run.score) for run in runs) for runs in own)])
     return markdown_table(["", *TUNING_TASKS], rows)
