@@ -1,6 +1,7 @@
 """What the tables and figures say, as numbers."""
 
 import functools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -98,6 +99,7 @@ class Reach(NamedTuple):
     :param seconds: median of ours
     :param peer_seconds: median of TRPO, to get there for the first time
     :param peer_training: median of TRPO, for the whole training
+    :param is_learned: whether TRPO ends with more than it began with, so that to be there says something
     """
 
     target: float
@@ -105,6 +107,7 @@ class Reach(NamedTuple):
     seconds: float
     peer_seconds: float
     peer_training: float
+    is_learned: bool
 
     @property
     def part(self) -> float:
@@ -121,7 +124,16 @@ def time_to_reach(own: dict[str, list[Run]]) -> Reach:
     ours = np.array([first_reach(run, target) for run in own[OURS]])
     peer = np.array([first_reach(run, target) for run in own[TRPO]])
     steps, seconds = (float(_median(ours[:, column])) for column in (0, 1))
-    return Reach(target, steps, seconds, float(_median(peer[:, 1])), training_seconds(own[TRPO]))
+    is_learned = target > float(interquartile_mean(np.array([run.returns[0] for run in own[TRPO]])))
+    return Reach(target, steps, seconds, float(_median(peer[:, 1])), training_seconds(own[TRPO]), is_learned)
+
+
+def fewest_runs(groups: Iterable[list[Run]]) -> int:
+    """
+    :param groups: of runs that something is said of
+    :return: the smallest number of runs
+    """
+    return min(len(runs) for runs in groups)
 
 
 def _median(values: np.ndarray) -> float:
