@@ -115,7 +115,7 @@ class ActionSampler:
         self._first_env = first_env
         self._layers = gaussian_layers(policy)
         self._std = policy.log_std.detach().exp() if self._layers else None
-        if self._std is not None and not (self._std > 0.0).all():
+        if self._std is not None and (self._std == 0.0).any():
             raise NumericalError("The policy's standard deviation is 0 in single precision; there is nothing left to explore.")
 
     def __call__(self, observations: Observations, step: int) -> np.ndarray:
