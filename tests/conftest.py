@@ -4,14 +4,17 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import pandas as pd
 import pytest
 import torch as th
 from hypothesis import settings
 from pendulum_task import PENDULUM
 from resuming import train
 from saved_models import saved, trained_model
+from sweep_table import CELLS, fill
 
 from sb3_gae import TRPOGAE
+from sb3_gae.sweep import SweepStudy, results_of
 
 # Small networks: more threads would only fight over the cores
 th.set_num_threads(1)
@@ -61,3 +64,11 @@ def some_model() -> TRPOGAE:
 @pytest.fixture(scope="module")
 def model_file(some_model: TRPOGAE) -> bytes:
     return saved(some_model)
+
+
+@pytest.fixture(scope="session")
+def sweep_table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+    """Results of seven curves, five seeds and four iterations; tests leave them as they are."""
+    study = SweepStudy("s", str(tmp_path_factory.mktemp("sweep") / "s.journal"))
+    fill(study, CELLS)
+    return results_of(study)

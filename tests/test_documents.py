@@ -6,12 +6,11 @@ from pathlib import Path
 
 import gymnasium
 import pytest
+from documented import DOCUMENTS, ROOT
 
 from sb3_gae.envs import TASKS
 from sb3_gae.sweep.cli import main
 
-ROOT = Path(__file__).parent.parent
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCKS = {
     f"{document.name}:{number}": code
     for document in DOCUMENTS

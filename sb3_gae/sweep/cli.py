@@ -4,6 +4,7 @@ import argparse
 import importlib.util
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -18,7 +19,7 @@ from sb3_gae.sweep.machine import check_jobs
 from sb3_gae.sweep.plan import Options, Plan, check_seeds, default_name, make_cells
 from sb3_gae.sweep.presets import find_preset
 from sb3_gae.sweep.report import failures, overview, running
-from sb3_gae.sweep.results import NO_PARQUET, read_results, results_of, select
+from sb3_gae.sweep.results import NO_PARQUET, is_selected, read_results, results_of, select
 from sb3_gae.sweep.runner import check_plan, run_plan, standings_of
 from sb3_gae.sweep.runs import combine, runs_of
 from sb3_gae.sweep.storage import holds
@@ -129,7 +130,7 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _import(args: argparse.Namespace) -> int:
-    table = _read(args.files)
+    table = combine((file, read_results(file)) for file in args.files)
     # An unknown --name begins a sweep
     study = SweepStudy(_name_of(args), args.storage)
     print(f"sweep {study.name!r}: {take_in(study, table)} of {len(list(runs_of(table)))} cells added, the others were there")
@@ -163,13 +164,11 @@ def _results_of(args: argparse.Namespace) -> tuple[pd.DataFrame, str]:
     if args.sources is not None:
         if args.storage is not None or args.name is not None or args.preset is not None:
             raise SweepError("`from` names files; leave out --storage, --name and --preset, or --from.")
-        return _read(args.sources), Path(args.sources[0]).name.split(".")[0]
+        tables = ((file, read_results(file)) for file in args.sources)
+        table = combine(tables, matters=partial(is_selected, **selection_of(args)))
+        return table, Path(args.sources[0]).name.split(".")[0]
     study = _study_of(args)
     return results_of(study), study.name
-
-
-def _read(files: Sequence[str]) -> pd.DataFrame:
-    return combine((file, read_results(file)) for file in files)
 
 
 def _study_of(args: argparse.Namespace) -> SweepStudy:

@@ -163,25 +163,12 @@ def select(
     table = finished(table)
     if table.empty:
         raise SweepError("No cell has finished yet; see: python -m sb3_gae.sweep status")
-    wanted = {
-        "task": tasks,
-        "condition": conditions,
-        "gamma": gammas,
-        "gae_lambda": lambdas,
-        "iterations": None if iterations is None else [iterations],
-    }
-    for column, values in wanted.items():
-        if values is None:
-            continue
-        chosen = list(values)
-        kept = table[column].isin(chosen)
-        if not kept.any():
+    for column, chosen in _wanted(tasks, conditions, gammas, lambdas, iterations).items():
+        if not table[column].isin(chosen).any():
             held = sorted(table[column].dropna().unique())
             there = f"there are {_listed(held)}" if held else "there is none"
             raise SweepError(f"The selection is empty: no finished cell has {column} {_listed(chosen)}; {there}.")
-        if column == "gae_lambda":
-            kept |= table[column].isna()
-        table = table[kept]
+        table = table[_keeps(table, column, chosen)]
     for column, option in {
         "task": "--env",
         "iterations": "--of-iterations",
@@ -193,6 +180,52 @@ def select(
             raise SweepError(f"The selection mixes runs whose {column} differ ({shown}); choose one with {option}.")
     check_alike(made_in(table), "leave out one of the files, or choose other --conditions, --gammas or --lambdas")
     return table
+
+
+def is_selected(
+    run: pd.DataFrame,
+    *,
+    tasks: Iterable[str] | None = None,
+    conditions: Iterable[str] | None = None,
+    gammas: Iterable[float] | None = None,
+    lambdas: Iterable[float] | None = None,
+    iterations: int | None = None,
+) -> bool:
+    """
+    :param run: rows of one run
+    :param tasks: as in :func:`select`, and so are the others
+    :param conditions: to keep
+    :param gammas: to keep
+    :param lambdas: to keep
+    :param iterations: of the cells to keep
+    :return: whether it would be kept
+    """
+    wanted = _wanted(tasks, conditions, gammas, lambdas, iterations)
+    return all(_keeps(run, column, chosen).all() for column, chosen in wanted.items())
+
+
+def _wanted(
+    tasks: Iterable[str] | None,
+    conditions: Iterable[str] | None,
+    gammas: Iterable[float] | None,
+    lambdas: Iterable[float] | None,
+    iterations: int | None,
+) -> dict[str, list[Any]]:
+    """:return: the values to keep of each column of which some are to be kept"""
+    wanted = {
+        "task": tasks,
+        "condition": conditions,
+        "gamma": gammas,
+        "gae_lambda": lambdas,
+        "iterations": None if iterations is None else [iterations],
+    }
+    return {column: list(values) for column, values in wanted.items() if values is not None}
+
+
+def _keeps(table: pd.DataFrame, column: str, chosen: list[Any]) -> "pd.Series[bool]":
+    """:return: for each row, whether it is kept; a condition without λ has none to choose by"""
+    kept = table[column].isin(chosen)
+    return kept | table[column].isna() if column == "gae_lambda" else kept
 
 
 def _listed(values: Iterable[Any]) -> str:

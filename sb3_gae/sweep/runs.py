@@ -1,7 +1,7 @@
 """Runs in a table of results: which rows are one, whether they are whole, and each one once."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -73,11 +73,14 @@ def check_runs(table: pd.DataFrame, where: str) -> None:
         )
 
 
-def combine(tables: Iterable[tuple[str, pd.DataFrame]]) -> pd.DataFrame:
+def combine(
+    tables: Iterable[tuple[str, pd.DataFrame]], matters: Callable[[pd.DataFrame], bool] = lambda run: True
+) -> pd.DataFrame:
     """
     :param tables: of finished runs, each with the name of its file
+    :param matters: says of a run's rows whether they will be used
     :return: all of them in one; of runs that are there several times the first
-    :raises SweepError: if these have different results
+    :raises SweepError: if these have different results, and matter
     """
     seen: dict[str, tuple[str, pd.DataFrame]] = {}
     tables = list(tables)
@@ -85,7 +88,7 @@ def combine(tables: Iterable[tuple[str, pd.DataFrame]]) -> pd.DataFrame:
         for run in runs_of(table):
             cell = cell_of(run.iloc[0])
             before, first = seen.setdefault(cell.key, (name, run))
-            if first is not run and not _have_same_results(first, run):
+            if first is not run and not _have_same_results(first, run) and matters(run):
                 of_cell = f"seed {cell.seed} of {cell.label}, {cell.iterations} iterations"
                 where = f"both {before} and {name}" if before != name else f"{name} twice"
                 raise SweepError(f"{of_cell} is in {where} with different results; leave out one of them.")
