@@ -1,6 +1,7 @@
 """The tutorials, as a reader runs them."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,22 +10,26 @@ import pytest
 
 TUTORIALS = Path(__file__).parent.parent / "docs" / "tutorials"
 
-#: a line that each prints, and files that it leaves
-ENDINGS = {
-    "beside_trpo": ("TRPOGAE", []),
-    "stop_and_continue": ("the same, bit for bit: True", ["checkpoints"]),
-    "what_lambda_trades": ("smallest sum: λ = ", ["what_lambda_trades.png"]),
-    "your_own_task": ("gae_lambda", ["swing_up_lambda.png"]),
+#: files that each leaves
+LEAVES = {
+    "beside_trpo": [],
+    "stop_and_continue": ["checkpoints"],
+    "what_lambda_trades": ["what_lambda_trades.png"],
+    "your_own_task": ["swing_up_lambda.png"],
 }
 
 
+def without_numbers(text: str) -> list[list[str]]:
+    """:return: the words of each line, with the same mark for every number"""
+    return [re.sub(r"-?\d[\d.]*(e[+-]\d+)?", " # ", line).split() for line in text.splitlines()]
+
+
 def test_every_tutorial_is_tried() -> None:
-    assert {path.stem for path in TUTORIALS.glob("*.py")} == set(ENDINGS)
+    assert {path.stem for path in TUTORIALS.glob("*.py")} == set(LEAVES)
 
 
-@pytest.mark.parametrize("name", ENDINGS)
+@pytest.mark.parametrize("name", LEAVES)
 def test_a_tutorial_runs(name: str, tmp_path: Path) -> None:
-    line, files = ENDINGS[name]
     environment = {**os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1", "PYTHONIOENCODING": "utf-8"}
     done = subprocess.run(
         [sys.executable, TUTORIALS / f"{name}.py"],
@@ -35,5 +40,6 @@ def test_a_tutorial_runs(name: str, tmp_path: Path) -> None:
         encoding="utf-8",
     )
     assert done.returncode == 0, done.stderr
-    assert line in done.stdout
-    assert all((tmp_path / file).exists() for file in files)
+    shown = (TUTORIALS / f"{name}.txt").read_text(encoding="utf-8")
+    assert without_numbers(done.stdout) == without_numbers(shown)
+    assert all((tmp_path / file).exists() for file in LEAVES[name])

@@ -27,6 +27,8 @@ _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "tuning long": tables.long_tuning_table,
     "origin": tables.origin_list,
 }
+#: preset that makes what a section needs, of those that would leave a chapter empty
+_PRESETS = {"classic": "classic", "three million": "mujoco-3m", "ablation": "ablation"}
 #: title of each figure, by the section of the page that it stands in
 _FIGURES = {
     "figure steps": ("peers_steps", "Return against steps on each task"),
@@ -42,7 +44,10 @@ def sections_of(table: pd.DataFrame) -> dict[str, str]:
     """
     has_figures = bool(tables.scores_table(table))
     drawn = {name: f"![{title}](images/{file}.svg)" * has_figures for name, (file, title) in _FIGURES.items()}
-    return {name: make(table) for name, make in _TABLES.items()} | drawn
+    made = {name: make(table) for name, make in _TABLES.items()}
+    for name, preset in _PRESETS.items():
+        made[name] = made[name] or f"Not run yet: `python -m benchmarks.peers run --preset {preset} --jobs 2`."
+    return made | drawn
 
 
 def write_report(page: Path = PAGE, images: Path = IMAGES) -> list[Path]:
