@@ -10,7 +10,8 @@ from benchmarks.peers.errors import PeersError
 from benchmarks.peers.page import filled
 from benchmarks.peers.table import read_results
 
-DOCS = Path(__file__).parents[2] / "docs"
+README = Path(__file__).parents[2] / "README.md"
+DOCS = README.parent / "docs"
 PAGE = DOCS / "benchmarks.md"
 IMAGES = DOCS / "images"
 
@@ -27,6 +28,8 @@ _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "tuning long": tables.long_tuning_table,
     "origin": tables.origin_list,
 }
+#: sections that README has as well
+OF_README = ("scores", "over tasks")
 #: preset that makes what a section needs, of those that would leave a chapter empty
 _PRESETS = {"classic": "classic", "three million": "mujoco-3m", "ablation": "ablation"}
 #: title of each figure, by the section of the page that it stands in
@@ -50,10 +53,11 @@ def sections_of(table: pd.DataFrame) -> dict[str, str]:
     return made | drawn
 
 
-def write_report(page: Path = PAGE, images: Path = IMAGES) -> list[Path]:
+def write_report(page: Path = PAGE, images: Path = IMAGES, readme: Path = README) -> list[Path]:
     """
     :param page: to be filled
     :param images: folder of the figures
+    :param readme: to be filled with :data:`OF_README`
     :return: paths of what was written
     :raises PeersError: if there are no results
     """
@@ -67,8 +71,10 @@ def write_report(page: Path = PAGE, images: Path = IMAGES) -> list[Path]:
     from sb3_gae.sweep.figures.files import SUFFIXES, save_figure
     from sb3_gae.sweep.figures.style import STYLE
 
-    page.write_text(filled(page.read_text(), sections_of(table)))
-    written = [page]
+    sections = sections_of(table)
+    page.write_text(filled(page.read_text(), sections))
+    readme.write_text(filled(readme.read_text(), {name: sections[name] for name in OF_README}))
+    written = [page, readme]
     images.mkdir(parents=True, exist_ok=True)
     with rc_context(STYLE):
         for name, figure in draw_all(table).items():
