@@ -16,7 +16,11 @@ BLOCKS = {
     for document in DOCUMENTS
     for number, code in enumerate(re.findall(r"^```python\n(.*?)^```", document.read_text(), re.MULTILINE | re.DOTALL))
 }
-LINKS = [(document, link) for document in DOCUMENTS for link in re.findall(r"\]\((?!https?:)([^)#]+)", document.read_text())]
+LINKS = [
+    (document, link)
+    for document in DOCUMENTS
+    for link in re.findall(r'(?:\]\(|<img src=")(?!https?:)([^)#"]+)', document.read_text())
+]
 
 
 def test_documents_have_code_and_links() -> None:

@@ -19,4 +19,6 @@ def test_the_page_says_what_the_committed_results_say(sections: dict[str, str]) 
 
 def test_readme_says_what_the_committed_results_say(sections: dict[str, str]) -> None:
     readme = report.README.read_text()
-    assert readme == filled(readme, {name: sections[name] for name in report.OF_README}), "run: python -m benchmarks.peers report"
+    assert readme == filled(readme, {name: sections[name] for name in report.OF_README}), (
+        "run: python -m benchmarks.peers report"
+    )

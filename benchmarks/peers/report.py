@@ -29,7 +29,7 @@ _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "origin": tables.origin_list,
 }
 #: sections that README has as well
-OF_README = ("scores", "over tasks")
+OF_README = ("scores",)
 #: preset that makes what a section needs, of those that would leave a chapter empty
 _PRESETS = {"classic": "classic", "three million": "mujoco-3m", "ablation": "ablation"}
 #: title of each figure, by the section of the page that it stands in
