@@ -33,7 +33,8 @@ class LambdaRule(Protocol):
     """
 
     @property
-    def target_lambda(self) -> float | None: ...
+    def target_lambda(self) -> float | None:
+        r""":math:`\lambda` of the value targets, in [0, 1]; None for that of the advantages."""
 
     def value(self, progress_remaining: float) -> float:
         """
@@ -62,11 +63,23 @@ class ScheduledLambda:
         self.schedule = schedule
 
     def value(self, progress_remaining: float) -> float:
+        """
+        :param progress_remaining: from 1 at the beginning of training to 0 at its end
+        :return: what the schedule says, for the batch to come
+        :raises ValueError: if that is no number in [0, 1]
+        """
         value = float(self.schedule(progress_remaining))
         check_number("gae_lambda", value, 0.0, 1.0)
         return value
 
     def learn_from(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> dict[str, float]:
+        """
+        A schedule learns nothing.
+
+        :param policy: not looked at
+        :param rollout_buffer: not looked at
+        :return: nothing to log
+        """
         return {}
 
 
@@ -90,9 +103,20 @@ class ExplainedVarianceLambda:
         self.explained_variance = 0.0
 
     def value(self, progress_remaining: float) -> float:
+        r"""
+        :param progress_remaining: from 1 at the beginning of training to 0 at its end; plays no part
+        :return: for the batch to come, from :math:`\lambda_{min}` to 1; 1 before the first batch
+        """
         return 1.0 - (1.0 - self.lowest) * max(self.explained_variance, 0.0)
 
     def learn_from(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> dict[str, float]:
+        """
+        Take the batch into the average, unless its explained variance is not finite, as where all returns are equal.
+
+        :param policy: not looked at
+        :param rollout_buffer: full, with its advantages computed
+        :return: the average, as ``explained_variance``; it begins at 0
+        """
         buffer = rollout_buffer
         returns = discounted_returns(buffer.rewards, buffer.next_values, buffer.dones, buffer.gamma)
         found = explained_variance(buffer.values[buffer.mask], returns[buffer.mask])
@@ -156,14 +180,33 @@ class MeasuredLambda:
         self._n_batches = 0
 
     def value(self, progress_remaining: float) -> float:
+        """
+        Put into use what the batches so far have led to.
+
+        :param progress_remaining: from 1 at the beginning of training to 0 at its end; plays no part
+        :return: for the batch to come, a number of the grid
+        """
         self._in_use = self.lambdas[self.place]
         return self._in_use
 
     @property
     def target_lambda(self) -> float:
+        r"""The :math:`\lambda` in use, but at most ``largest_target_lambda``."""
         return min(self._in_use, self.largest_target_lambda)
 
     def learn_from(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> dict[str, float]:
+        r"""
+        Measure the batch, take it into the averages, and move by one place of the grid at most.
+
+        A batch of a single trajectory changes nothing, and neither does a measurement that fails or is not finite.
+
+        :param policy: in evaluation mode, as it was when the rollout was collected
+        :param rollout_buffer: full, with its advantages computed
+        :return: the averages for each :math:`\lambda` of the grid, as ``<quantity>/lambda_<value>``: ``bias_squared`` and
+            ``variance`` in units of the variance at :math:`\lambda = 1`, ``improvement`` in those of its square root. Nothing
+            if the batch has changed nothing
+        :raises ValueError: if the buffer is not full
+        """
         if not has_several_trajectories(rollout_buffer):
             return {}
         try:

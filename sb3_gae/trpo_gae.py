@@ -260,6 +260,8 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         :param n_rollout_steps: steps of each environment
         :return: False if the callback ended training before the buffer was full
         :raises NumericalError: if a parameter of the policy, an observation, action, reward or value is not finite
+        :raises ValueError: if a schedule or rule of ``gae_lambda`` leaves [0, 1]
+        :raises WorkersLostError: if the environments are on workers that are gone and cannot be replaced
         """
         assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
         # First, so that a callback finds everything as the last iteration left it
@@ -473,6 +475,22 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
+        """
+        Learn, one rollout and one update after the other.
+
+        :param total_timesteps: steps of all environments together; the rollout that reaches them is the last
+        :param callback: called at each step, and at the beginning and the end of each rollout
+        :param log_interval: iterations from one log to the next
+        :param tb_log_name: of the run in TensorBoard
+        :param reset_num_timesteps: whether the steps are counted from 0; False to go on with a training
+        :param progress_bar: whether to show one, for which tqdm and rich must be installed
+        :return: this model
+        :raises NumericalError: if a number that must be finite is not, or the linear algebra breaks down; policy and optimiser
+            are then as they were after the last update
+        :raises ValueError: if a schedule or rule of ``gae_lambda`` leaves [0, 1], or the action distribution depends on no
+            trainable parameter
+        :raises WorkersLostError: if workers are gone and cannot be replaced; the message says how to go on
+        """
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:

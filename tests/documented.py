@@ -11,18 +11,29 @@ DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 def commands_in(text: str) -> list[list[str]]:
     """
     :param text: of a page, whose shell blocks each begin in the folder of the checkout
-    :return: the words of each command in them, continued lines joined, and of those in sentences
+    :return: the words of each command in them, continued lines joined, and then of those in sentences and tables
     """
     lines = []
     for block in re.findall(r"^```bash\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         lines += [*block.replace("\\\n", " ").splitlines(), *(["cd ."] if re.search("^cd ", block, re.MULTILINE) else [])]
-    in_sentences = re.findall(r"(?<!`)`((?:python|make) [^`…]+)`(?!`)", text)
-    lines += [
-        line.replace("\n", " ")
-        for line in in_sentences
-        if "..." not in line and not line.endswith((" -m", "sb3_gae.sweep")) and not re.search(r"\b[A-Z]{2,}\b", line)
-    ]
+    lines += _in_sentences(text)
     return [words for line in lines if (words := shlex.split(line, comments=True))]
+
+
+def _in_sentences(text: str) -> list[str]:
+    """:return: commands between single backticks; ``… --more`` is the last whole one with more to it"""
+    lines, whole = [], ""
+    for found in re.findall(r"(?<!`)`((?:python|make|…) [^`]+)`(?!`)", text):
+        line = found.replace("\n", " ")
+        # Neither those with a gap, nor those with a name in capitals for what the reader has
+        if re.search(r"\.\.\.|.…|\b[A-Z]{2,}\b", line) or line.endswith((" -m", "sb3_gae.sweep")):
+            continue
+        if line.startswith("…"):
+            lines.append(f"{whole}{line[1:]}")
+        else:
+            lines.append(line)
+            whole = line
+    return lines
 
 
 #: those of each document, by its name, in its order

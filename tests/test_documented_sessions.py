@@ -1,4 +1,8 @@
-"""What README and docs give to type in a shell, typed in the order of each page, on sizes of seconds."""
+"""
+What README and docs give to type in a shell, page by page: the blocks in their order and then what stands in sentences.
+
+Each command is that of the page with smaller sizes, so that it ends within seconds.
+"""
 
 import os
 import re
@@ -9,12 +13,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from documented import COMMANDS, ROOT, after_python
 from rliable import library
 
 from sb3_gae.sweep.cli import main
+from sb3_gae.zoo import default_hyperparams_path
 
-#: added to a command, so that it ends soon; of an option that is given twice the last one counts
+#: what is added to a command that has these words; of an option that is given twice the last one counts
 SMALLER = {
     "sb3_gae.sweep": "",
     "sb3_gae.sweep run": "--seeds 1 --iterations 2 --jobs 1 --no-progress -params n_envs:2 n_steps:64",
@@ -23,69 +29,87 @@ SMALLER = {
     "rl_zoo3.train --trained-agent": "-n 4352 --eval-freq -1 -params n_envs:2 n_steps:64",
     "rl_zoo3.train --trial-id": "-n 256 --eval-freq -1 --trial-id 1 -params n_envs:2 n_steps:64",
     "rl_zoo3.enjoy": "-n 20 --no-render",
-    # All that is committed has been run: it says so, and prints the table
+    # What is committed has been run: it says so, and prints the table
     "benchmarks/first_results.py": "",
     "benchmarks/ray_scaling_model.py": "",
     "benchmarks.gate draw": "",
+    "docs/gridworld_figures.py": "",
+    "docs/training_figures.py": "",
+    "docs/rules_over_tasks.py": "",
 }
 
-#: by the words that a command has, where else it is run, or why it is not
+#: Python programs and arguments that another test runs, and the name that it knows them by
 ELSEWHERE = {
-    "make": "by CI, which does what each of its targets does; `make train` is run here",
-    ".ci/release": "by CI",
-    "benchmarks.gate": "by CI; tests/test_gate.py",
-    "benchmarks.peers": "tests/test_peers_run.py, tests/test_peers_page.py",
-    "benchmarks.speed": "tests/test_speed_benchmarks.py",
-    "benchmarks/speed/bench.py": "tests/test_speed_benchmarks.py",
-    "benchmarks/paper_tasks.py": "half a day; its runs are those of rl-zoo3",
-    "benchmarks/update_speed.py": "minutes of a quiet machine; tests/test_speed_benchmarks.py",
+    "benchmarks.peers": ("test_peers_run", "peers"),
+    "docs/house.py": ("test_house", "house"),
+    "docs/measured_lambda.py": ("test_document_figures", "measured_lambda"),
+    "docs/lambda_variants.py": ("test_document_figures", "lambda_variants"),
+    "docs/value_errors.py": ("test_document_figures", "value_errors"),
+    "benchmarks/fault_injection.py": ("test_fault_injection", "fault_injection"),
+    "sb3_gae.gridworld": ("test_lab_page", "sb3_gae.gridworld"),
+    "rl_zoo3.record_video": ("test_zoo_verbs", "record_video"),
+    "rl_zoo3.record_training": ("test_zoo_verbs", "record_training"),
+    "rl_zoo3.plots.plot_train": ("test_zoo_verbs", "plots.plot_train"),
+    "rl_zoo3.plots.all_plots": ("test_zoo_verbs", "plots.all_plots"),
+    "rl_zoo3.plots.plot_from_file": ("test_zoo_verbs", "plots.plot_from_file"),
+    "rl_zoo3.benchmark": ("test_zoo_verbs", "benchmark"),
+    "enjoy.py": ("test_zoo_verbs", "enjoy.py"),
+    "--load-best": ("test_zoo_verbs", "--load-best"),
+    "--load-last-checkpoint": ("test_zoo_verbs", "--load-last-checkpoint"),
+    "postgresql+psycopg://me@server/sweeps": ("test_sweep_postgresql", "postgresql_server"),
+    "rollout_workers:2": ("test_zoo_keys", "rollout_workers"),
+}
+
+#: Python programs and arguments that no test runs, and why
+NOT_RUN = {
+    "benchmarks.gate": "by CI without arguments; with them minutes of a quiet machine",
+    "benchmarks.speed": "minutes of a quiet machine; test_speed_benchmarks makes the report",
+    "benchmarks/speed/bench.py": "it times, and tests time nothing",
+    "benchmarks/update_speed.py": "minutes of a quiet machine",
     "benchmarks/rollout_speed.py": "minutes of a quiet machine",
-    "benchmarks/ray_speed.py": "minutes of a quiet machine; tests/test_ray_scaling.py",
-    "benchmarks/ray_hosts.py": "network namespaces; tests/test_ray_hosts.py",
-    "benchmarks/fault_injection.py": "minutes; tests/test_fault_injection.py",
+    "benchmarks/ray_speed.py": "minutes of a quiet machine",
+    "benchmarks/ray_hosts.py": "network namespaces, for which it has to be root",
+    "benchmarks/paper_tasks.py": "hours, and a minute for the report alone",
     "benchmarks/soak.py": "an hour",
-    "benchmarks/dial_latency.py": "a quiet machine and a browser; tests/test_lab_page.py",
-    "docs/house.py": "tests/test_house.py",
+    "benchmarks/dial_latency.py": "a quiet machine and a browser",
     "docs/contact_sheet.py": "agents that are trained for hours",
-    "docs/record_biped.py": "tests/test_rollout_file.py",
-    "docs/gridworld_figures.py": "tests/test_document_figures.py",
-    "docs/measured_lambda.py": "tests/test_document_figures.py",
-    "docs/lambda_variants.py": "tests/test_document_figures.py",
-    "docs/training_figures.py": "tests/test_document_figures.py",
-    "docs/value_errors.py": "tests/test_document_figures.py",
-    "docs/rules_over_tasks.py": "tests/test_sweep_ranking.py",
-    "sb3_gae.gridworld": "serves until it is stopped; tests/test_lab_cli.py",
-    "rl_zoo3.record_video": "tests/test_zoo_verbs.py",
-    "rl_zoo3.record_training": "tests/test_zoo_verbs.py",
-    "rl_zoo3.plots.plot_train": "tests/test_zoo_verbs.py",
-    "rl_zoo3.plots.all_plots": "tests/test_zoo_verbs.py",
-    "rl_zoo3.plots.plot_from_file": "tests/test_zoo_verbs.py",
-    "rl_zoo3.benchmark": "tests/test_zoo_verbs.py",
-    "enjoy.py": "tests/test_zoo_verbs.py",
-    "importtime": "tests/test_zoo_hook.py",
-    "rollout_workers:2": "tests/test_ray_workers.py",
-    "postgresql+psycopg": "tests/test_sweep_postgresql.py",
-    "pip": "by CI",
-    "source": "nothing to see",
-    "sudo": "changes the machine",
-    "ray": "a cluster",
+    "docs/record_biped.py": "a minute of training",
+    "importtime": "nothing of ours but the import, which test_zoo_hook looks at",
+    "checkpoints/rl_model_4096_steps.zip": "a checkpoint of the reader's; docs/checkpoints.md has one that is made here",
+    "--track": "an account",
     "train.py": "a cluster",
 }
-#: blocks that are for a cluster altogether
-OF_CLUSTERS = ("srun", "scontrol", "helm", "kubectl", "SLURM", "ray get-auth-token", "RAY_ADDRESS", "RAY_AUTH_MODE", "sleep")
 
-#: what a reader has by then
-A_TASK = """
-import gymnasium
+#: other programs that are not run, and why
+NOT_PYTHON = {
+    "make": "CI makes check, test, docs and bench; of the others `make train` is run here",
+    "release": "by CI with the lowest versions, by hand with the highest",
+    "pip": "CI installs",
+    "source": "nothing to see",
+    "sudo": "changes the machine",
+    **dict.fromkeys(["ray", "srun", "helm", "kubectl", "sleep", "export"], "a cluster"),
+}
+#: parts of lines of a script for a cluster
+OF_CLUSTERS = ("$SLURM_JOB_NODELIST", "$head", "$address", "rollout_workers:127", "rollout_workers:128")
 
-gymnasium.register("{id}", entry_point="gymnasium.envs.classic_control:PendulumEnv", max_episode_steps=50)
-"""
+
+def program_and_arguments(words: list[str]) -> list[str]:
+    return [word for word in after_python(words) if word != "-m"]
 
 
-def elsewhere(words: list[str]) -> bool:
-    line = shlex.join(words)
-    return any(word in line for word in OF_CLUSTERS) or any(
-        word in ELSEWHERE or word.partition("://")[0] in ELSEWHERE for word in [*words, Path(words[0]).name]
+def how(words: list[str]) -> str:
+    """:return: the key of :data:`SMALLER` that fits best, empty if none does"""
+    rest = program_and_arguments(words)
+    keys = [key for key in SMALLER if rest[:1] == key.split()[:1] and set(key.split()) <= set(rest)]
+    return max(keys, key=len, default="")
+
+
+def is_left_out(words: list[str]) -> bool:
+    named = set(program_and_arguments(words)) - set(how(words).split())
+    return (
+        Path(words[0]).name in NOT_PYTHON
+        or bool(named & (ELSEWHERE.keys() | NOT_RUN.keys()))
+        or any(word in shlex.join(words) for word in OF_CLUSTERS)
     )
 
 
@@ -97,21 +121,18 @@ def recipe(target: str) -> list[str]:
 
 
 def to_run(document: str) -> list[list[str]]:
-    """:return: the page's commands that are run here, each once in a folder"""
+    """:return: the page's commands that are run here, each once, and those that change the folder"""
     found: list[list[str]] = []
     for words in COMMANDS[document]:
         command = recipe("train") if words == ["make", "train"] else words
-        if command[0] == "cd" or (not elsewhere(command) and command not in found):
+        if command[0] == "cd" or (not is_left_out(command) and command not in found):
             found.append(command)
     return found
 
 
 def smaller(words: list[str]) -> list[str]:
-    """:return: what the interpreter is given, and :data:`SMALLER` of it, their hyperparameters in one place"""
-    rest = [word for word in after_python(words) if word != "-m"]
-    keys = [key for key in SMALLER if rest[0] == key.split()[0] and set(key.split()[1:]) <= set(rest)]
-    assert keys, f"Say in SMALLER how to run it on a small size, or in ELSEWHERE what does: {shlex.join(words)}"
-    given, more = list(rest), SMALLER[max(keys, key=len)].split()
+    """:return: program and arguments, and :data:`SMALLER` of it, their hyperparameters in one place"""
+    given, more = program_and_arguments(words), SMALLER[how(words)].split()
     if "-params" in given and "-params" in more:
         start = given.index("-params")
         stop = next((n for n in range(start + 1, len(given)) if given[n].startswith("-")), len(given))
@@ -120,15 +141,36 @@ def smaller(words: list[str]) -> list[str]:
     return given + more
 
 
+def test_every_command_is_run_or_it_is_said_why_not() -> None:
+    commands = [words for document in COMMANDS for words in to_run(document) if words[0] != "cd"]
+    assert [shlex.join(words) for words in commands if not how(words)] == []
+
+
+def test_what_is_said_of_other_commands_is_true() -> None:
+    commands = [words for of_page in COMMANDS.values() for words in of_page]
+    used = {word for words in commands for word in (*words, Path(words[0]).name)}
+    assert {*ELSEWHERE, *NOT_RUN, *NOT_PYTHON} - used == set(), "no page has it any more"
+    for word, (test, name) in ELSEWHERE.items():
+        assert name in (ROOT / "tests" / f"{test}.py").read_text(), word
+
+
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """What a reader finds in the folder of the checkout, and the files that pages speak of."""
+    """What a reader finds in the folder of the checkout, and the modules that pages tell to write."""
     ignored = shutil.ignore_patterns("_build", "__pycache__")
     for name in ("benchmarks", "docs"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)
-    (tmp_path / "my_module.py").write_text(A_TASK.format(id="MyEnv-v0"))
-    (tmp_path / "my_tasks.py").write_text(A_TASK.format(id="SwingUp-v0"))
+    (tmp_path / "my_module.py").write_text(block_of("sweeps.md", "MyEnv-v0"))
+    # The task without the training that the page shows with it
+    (tmp_path / "my_tasks.py").write_text(block_of("tasks.md", "SwingUp-v0").partition("\nenv = ")[0])
     return tmp_path
+
+
+def block_of(document: str, word: str, language: str = "python") -> str:
+    """:return: the page's first block with that word"""
+    text = (ROOT / "docs" / document).read_text()
+    blocks = re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    return next(block for block in blocks if word in block)
 
 
 def at_work(document: str) -> bool:
@@ -145,7 +187,7 @@ def test_a_page_can_be_typed(document: str, checkout: Path, monkeypatch: pytest.
     estimates = library.get_interval_estimates
     # The numbers are of no interest here, and a page has dozens of tables
     monkeypatch.setattr(library, "get_interval_estimates", lambda *args, **kwargs: estimates(*args, **(kwargs | {"reps": 20})))
-    prepare(document)
+    PREPARATIONS.get(document, lambda: None)()
     for words in to_run(document):
         if words[0] == "cd":
             os.chdir(checkout / words[1])
@@ -153,17 +195,35 @@ def test_a_page_can_be_typed(document: str, checkout: Path, monkeypatch: pytest.
             run(smaller(words))
 
 
-def prepare(document: str) -> None:
-    """Leave in the current folder what a page takes to be there."""
-    if document == "sweeps.md":
-        of_another = "run --env MyEnv-v0 --gym-packages my_module --gammas .96 --lambdas .92 --first-seed 7"
-        run(smaller(["python", "-m", "sb3_gae.sweep", *of_another.split()]))
-        run(["sb3_gae.sweep", "export", "--name", "MyEnv-v0", "-o", "from_there.csv"])
-        shutil.rmtree("logs")
-    elif document == "checkpoints.md":
-        (callback,) = re.findall(r'"(callback:\[.*\])"', (ROOT / "docs" / document).read_text())
-        train = ["rl_zoo3.train", "--algo", "trpo_gae", "--env", "CartPole-v1", "-n", "4096", "--eval-freq", "-1"]
-        run([*train, "-params", "n_envs:2", "n_steps:64", callback])
+def results_of_another_machine() -> None:
+    another = "run --env MyEnv-v0 --gym-packages my_module --gammas .96 --lambdas .92 --first-seed 7"
+    run(smaller(["python", "-m", "sb3_gae.sweep", *another.split()]))
+    run(["sb3_gae.sweep", "export", "--name", "MyEnv-v0", "-o", "from_there.csv"])
+    shutil.rmtree("logs")
+
+
+def checkpoints_as_the_page_makes_them() -> None:
+    train = ["rl_zoo3.train", "--algo", "trpo_gae", "--env", "CartPole-v1", "-n", "4096", "--eval-freq", "-1"]
+    small = ["-params", "n_envs:2", "n_steps:64"]
+    (callback,) = re.findall(r'"(callback:\[.*\])"', (ROOT / "docs" / "checkpoints.md").read_text())
+    run([*train, *small, callback])
+    shutil.rmtree("checkpoints")
+    write_settings("CartPole-v1", yaml.safe_load(block_of("checkpoints.md", "callback", "yaml"))["CartPole-v1"])
+    run([*train, *small, "--conf-file", "my_settings.yml"])
+
+
+def write_settings(task_id: str, more: dict[str, object]) -> None:
+    """The shipped settings of a task and more, in a file of the reader's."""
+    settings = yaml.safe_load(default_hyperparams_path().read_text())[task_id]
+    Path("my_settings.yml").write_text(yaml.safe_dump({task_id: settings | more}))
+
+
+#: what is done before the commands of a page, so that there is what it takes to be there
+PREPARATIONS = {
+    "sweeps.md": results_of_another_machine,
+    "checkpoints.md": checkpoints_as_the_page_makes_them,
+    "zoo.md": lambda: write_settings("HalfCheetah-v5", {}),
+}
 
 
 def run(words: list[str]) -> None:
@@ -174,5 +234,5 @@ def run(words: list[str]) -> None:
         return
     module = [] if program.endswith(".py") else ["-m"]
     command = [sys.executable, *module, program, *rest]
-    ended = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    ended = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=600)
     assert ended.returncode == 0, f"{shlex.join(words)}\n{ended.stdout}"

@@ -55,6 +55,7 @@ class Rollout:
     :param mask: which steps belong to the batch, shape (T, N)
     :param scores: see :mod:`sb3_gae.diagnostics.projected_scores`, of the steps of the batch in the order of
         ``mask``, shape (B, n)
+    :raises ValueError: if a factor is out of range, shapes do not fit, there are fewer than 2 steps, or a number is not finite
     """
 
     name: str
@@ -89,6 +90,8 @@ def record(policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer, name: st
     :param name: of what is recorded
     :param gae_lambda: in training
     :return: what :func:`save_rollout` takes
+    :raises ValueError: if the buffer is not full, ``gae_lambda`` is out of range, there are fewer than 2 steps, or a number is
+        not finite
     """
     # A batch of whole episodes may fill a small part of its buffer
     n_steps = int(np.flatnonzero(rollout_buffer.mask.any(axis=1))[-1]) + 1

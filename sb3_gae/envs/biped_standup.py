@@ -13,7 +13,15 @@ _START_HEIGHT = 0.2
 
 
 class BipedStandup(Biped):
-    """Reward :math:`-(h_{head} - 1.5)^2 - 10^{-5}|u|^2`, and no end but the time limit; see :class:`GaeBipedStandupEnv`."""
+    """
+    Reward :math:`-(h_{head} - 1.5)^2 - 10^{-5}|u|^2`, and no end but the time limit; see :class:`GaeBipedStandupEnv`.
+
+    By default the weight and the height are the paper's (section 6.2.2).
+
+    :param torque_cost_weight: of :math:`|u|^2`, the motors' torques in N·m
+    :param target_head_height: that the head is to be at, in m
+    :param reset_noise: by which place, joints, turn and velocities may differ from lying at rest, in m, rad, m/s and rad/s
+    """
 
     def __init__(self, torque_cost_weight: float = 1e-5, target_head_height: float = 1.5, reset_noise: float = 0.05):
         super().__init__(torque_cost_weight=torque_cost_weight, reset_noise=reset_noise)
@@ -49,7 +57,13 @@ class GaeBipedStandupEnv(MujocoTaskEnv):
 
     **End**: never before the time limit. **Start**: on the back; place, joints, turn and velocities moved by up to 0.05.
 
-    :param task_kwargs: ``torque_cost_weight``, ``target_head_height`` and ``reset_noise``, by default as above
+    :param render_mode: ``"human"``, ``"rgb_array"``, ``"depth_array"`` or None
+    :param width: of rendered images, in pixels
+    :param height: of rendered images, in pixels
+    :param task_kwargs: settings of the task: ``torque_cost_weight`` (for torques in N·m), ``target_head_height`` (m) and
+        ``reset_noise`` (in the unit of each number), by default as above
+    :raises ValueError: if ``render_mode`` is unknown
+    :raises TypeError: if a setting is unknown
     """
 
     def __init__(self, render_mode: str | None = None, width: int = 480, height: int = 480, **task_kwargs: float):

@@ -11,7 +11,14 @@ from sb3_gae.envs.mujoco_task import MujocoTask, PhysicsStates
 
 
 class CartPole(MujocoTask):
-    """Reward 1 a step until pole or cart leave their range; see :class:`GaeCartPoleEnv`."""
+    """
+    Reward 1 a step until pole or cart leave their range; see :class:`GaeCartPoleEnv`.
+
+    :param force: that pushes the cart to either side, in N
+    :param largest_angle: of the pole from upright, in rad; beyond it the episode ends
+    :param largest_position: of the cart from the middle, in m; beyond it the episode ends
+    :param reset_noise: by which each number of the first state may differ from 0, in m, rad, m/s and rad/s
+    """
 
     def __init__(
         self,
@@ -67,7 +74,13 @@ class GaeCartPoleEnv(MujocoTaskEnv):
     **End**: the pole is more than 12° from upright, or the cart more than 2.4 m from the middle. **Start**: every number
     uniform in ±0.05.
 
-    :param task_kwargs: ``force``, ``largest_angle`` (rad), ``largest_position`` (m) and ``reset_noise``, by default as above
+    :param render_mode: ``"human"``, ``"rgb_array"``, ``"depth_array"`` or None
+    :param width: of rendered images, in pixels
+    :param height: of rendered images, in pixels
+    :param task_kwargs: settings of the task: ``force`` (N), ``largest_angle`` (rad), ``largest_position`` (m) and
+        ``reset_noise`` (in the unit of each number), by default as above
+    :raises ValueError: if ``render_mode`` is unknown
+    :raises TypeError: if a setting is unknown
     """
 
     def __init__(self, render_mode: str | None = None, width: int = 480, height: int = 480, **task_kwargs: float):

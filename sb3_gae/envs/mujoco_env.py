@@ -22,6 +22,7 @@ class MujocoTaskEnv(gym.Env):
     :param width: of rendered images, in pixels
     :param height: of rendered images, in pixels
     :param camera_name: of the model's cameras
+    :raises ValueError: if ``render_mode`` is unknown
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array", "depth_array"]}  # type: ignore[misc]
@@ -68,6 +69,15 @@ class MujocoTaskEnv(gym.Env):
         return self._observation(), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """
+        Take one control step, which lasts ``dt`` seconds.
+
+        :param action: of the action space
+        :return: observation, shape (n,); reward; whether the task has ended; whether the numbers blew up, since a time limit
+            is a wrapper's; and the terms of the reward by name
+        :raises gymnasium.error.ResetNeeded: if there was no ``reset`` before
+        :raises ValueError: if the shape of the action is not that of the action space
+        """
         if not self._was_reset:
             raise gym.error.ResetNeeded("Call `reset` before `step`.")
         action = np.asarray(action)

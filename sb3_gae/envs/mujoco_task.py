@@ -120,6 +120,7 @@ class MujocoTask:
         """
         :param states: N states
         :return: the terms of the reward, each of shape (N,); the reward is their sum
+        :raises NotImplementedError: unless a subclass says what they are
         """
         raise NotImplementedError
 

@@ -14,6 +14,15 @@ LEGS = ("front_left_leg_force", "back_left_leg_force", "back_right_leg_force", "
 class Quadruped(RunForward):
     """
     Reward :math:`v_{fwd} - 10^{-6}|u|^2 - 10^{-3}|f_{impact}|^2 + 0.05`; see :class:`GaeQuadrupedEnv`.
+
+    By default weights, bonus and lowest height are the paper's (section 6.2.2).
+
+    :param torque_cost_weight: of :math:`|u|^2`, the motors' torques in N·m
+    :param impact_cost_weight: of :math:`|f_{impact}|^2`, the ground's forces on the legs in N
+    :param largest_impact_force: each component of a force is cut to this before it is squared, in N
+    :param alive_bonus: for each step
+    :param lowest_height: of the torso, in m; below it the episode ends
+    :param reset_noise: by which each number of the first state may differ from the standing pose, in m, rad, m/s and rad/s
     """
 
     def __init__(
@@ -69,8 +78,14 @@ class GaeQuadrupedEnv(MujocoTaskEnv):
 
     **End**: the torso is lower than 0.2 m. **Start**: the standing pose, every number moved by up to 0.02.
 
-    :param task_kwargs: ``torque_cost_weight``, ``impact_cost_weight``, ``largest_impact_force``, ``alive_bonus``,
-        ``lowest_height`` and ``reset_noise``, by default as above
+    :param render_mode: ``"human"``, ``"rgb_array"``, ``"depth_array"`` or None
+    :param width: of rendered images, in pixels
+    :param height: of rendered images, in pixels
+    :param task_kwargs: settings of the task: ``torque_cost_weight`` (for torques in N·m), ``impact_cost_weight`` (for forces
+        in N), ``largest_impact_force`` (N), ``alive_bonus``, ``lowest_height`` (m) and ``reset_noise`` (in the unit of each
+        number), by default as above
+    :raises ValueError: if ``render_mode`` is unknown
+    :raises TypeError: if a setting is unknown
     """
 
     def __init__(self, render_mode: str | None = None, width: int = 480, height: int = 480, **task_kwargs: float):

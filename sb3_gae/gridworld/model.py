@@ -83,6 +83,7 @@ def gridworld(
     :param trap: row and column
     :param start: row and column, or a probability for each cell, shape (size, size)
     :param slip: probability of moving at a right angle to the intended direction, half of it to either side
+    :return: S = ``size**2`` states, A = 4 actions
     :raises ValueError: if a cell lies outside, goal, trap and start are not different, or a probability is none
     """
     check_count("size", size, low=2)

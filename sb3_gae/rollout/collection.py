@@ -175,6 +175,7 @@ def take_steps(
     :param plan: how many steps to take
     :param quota: whoever takes the steps adds the endings; the last step is the one that meets it
     :param first_env: number of the first environment, for messages
+    :return: at most ``plan.n_steps`` steps of all environments
     :raises NumericalError: if an observation, action or reward is not finite
     """
     if plan.use_sde:

@@ -210,6 +210,7 @@ class GAERolloutBuffer(RolloutBuffer):
 
         :param batch_size: None for everything at once
         :return: samples in a random order
+        :raises ValueError: if the buffer is not full
         """
         self._check_full()
         indices = np.flatnonzero(self.mask)[np.random.permutation(self.n_samples)]
@@ -221,6 +222,7 @@ class GAERolloutBuffer(RolloutBuffer):
         Everything in the order of storage, time first; on the CPU without a copy unless steps are masked.
 
         :return: tensors of ``n_samples`` samples, T times N unless steps are masked
+        :raises ValueError: if the buffer is not full
         """
         self._check_full()
         return self._get_samples(slice(None) if self.mask.all() else np.flatnonzero(self.mask))

@@ -39,6 +39,7 @@ class PortableModel(OnPolicyAlgorithm):
 
         :param path: of the file; ``.safetensors`` is usual
         :raises ValueError: if policy or settings cannot be written so; ``save`` can write everything
+        :raises OSError: if the file cannot be written; what was there before is still there
         """
         aliases = [name for name, kind in self.policy_aliases.items() if kind is self.policy_class]
         if not aliases:

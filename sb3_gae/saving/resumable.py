@@ -110,6 +110,14 @@ class ResumableModel(SavedModel):
         self._rescue = rescue
 
     def learn(self, *args: Any, **kwargs: Any) -> Self:
+        """
+        As the algorithm's own; at its end, whatever that is, it sees to what callbacks have asked for.
+
+        :param args: as the algorithm's
+        :param kwargs: as the algorithm's
+        :return: this model
+        :raises WorkersLostError: if workers are lost; the message says how to go on
+        """
         self._rescue = None
         with ExitStack() as self._end_of_learning:
             try:

@@ -25,6 +25,7 @@ class SavedModel(BaseAlgorithm):
         :param exact_match: whether every parameter must be given
         :param device: on which to load
         :raises ValueError: if something does not fit, or the file is damaged
+        :raises FileNotFoundError: if there is no such file
         """
         if not isinstance(load_path_or_dict, dict):
             check_saved_file(load_path_or_dict, own=False)
@@ -46,6 +47,7 @@ class SavedModel(BaseAlgorithm):
         :param kwargs: as SB3's; further ones replace what was saved
         :return: a new model
         :raises ValueError: if the file is damaged, or was saved by another algorithm
+        :raises FileNotFoundError: if there is no such file
         """
         check_saved_file(path)
         return super().load(path, env, *args, **kwargs)

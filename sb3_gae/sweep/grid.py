@@ -95,6 +95,7 @@ def product(conditions: Iterable[str], gammas: Iterable[float], lambdas: Iterabl
     :param gammas: discount factors
     :param lambdas: weights of longer estimates
     :return: every combination; a condition without λ once for each γ
+    :raises SweepError: if there is no condition of a name
     """
     weights: list[float | None] = [*lambdas] or [None]
     pairs = itertools.product(conditions, gammas, weights)

@@ -30,6 +30,7 @@ def results_of(study: SweepStudy, *, partial: bool = False) -> pd.DataFrame:
     :param partial: whether to include what is stored of other runs; a column ``state`` then tells ``done``, ``running``,
         ``failed``, ``stopped`` and ``lost`` apart
     :return: finished cells, with the columns of :data:`~sb3_gae.sweep.results.COLUMNS`, in the order of their trials
+    :raises SweepError: if the storage cannot be used any more
     """
     trials = study.trials()
     done = {

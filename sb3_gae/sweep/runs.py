@@ -27,6 +27,7 @@ def cell_of(row: Any) -> Cell:
     """
     :param row: of a table of results
     :return: the cell that it is of
+    :raises SweepError: if a value is outside its domain
     """
     gae_lambda = None if math.isnan(row.gae_lambda) else row.gae_lambda
     return Cell(row.task, row.condition, row.gamma, gae_lambda, int(row.seed), int(row.iterations), row.overrides)

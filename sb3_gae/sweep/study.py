@@ -42,6 +42,9 @@ class TakenOverError(RuntimeError):
 
 class SweepStudy:
     """
+    The trials of a sweep. Every method raises :class:`~sb3_gae.sweep.errors.SweepError` if the storage cannot be used any
+    more.
+
     :param name: of the sweep
     :param location: path or URL of the storage; None for ``logs/sweeps/<name>.journal``
     :param create: whether to begin a sweep that is not there
@@ -285,7 +288,8 @@ class SweepStudy:
 
 class Claim:
     """
-    A cell that this process runs. Every method raises :class:`TakenOverError` if it has lost the cell.
+    A cell that this process runs. Every method raises :class:`TakenOverError` if it has lost the cell, and
+    :class:`~sb3_gae.sweep.errors.SweepError` if the storage cannot be used any more.
 
     :param sweep: the cell is of
     :param cell: to be run

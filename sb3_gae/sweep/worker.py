@@ -114,6 +114,7 @@ def work_as_process(plan: Plan, messages: Any, has_claimed: Any) -> None:
     :param plan: what to run
     :param messages: a queue for the one line to print if it cannot go on
     :param has_claimed: a shared number without a lock, which becomes 1 with the first cell
+    :raises SystemExit: with status 2, once the line is in the queue
     """
     stop = StopRequest()
     stop.listen()

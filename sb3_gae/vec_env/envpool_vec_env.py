@@ -81,6 +81,11 @@ class EnvPoolVecEnv(BatchedVecEnv):
         self._last_observations = np.zeros((self.num_envs, *self.observation_space.shape))  # type: ignore[misc]
 
     def step_async(self, actions: np.ndarray) -> None:
+        """
+        :param actions: of the action space, shape (N, ...)
+        :raises gymnasium.error.ResetNeeded: if there was no ``reset`` before
+        :raises ValueError: if the shape is wrong
+        """
         actions = self._check_actions(actions)
         self._pool.send(actions)
 
@@ -135,11 +140,25 @@ class EnvPoolVecEnv(BatchedVecEnv):
         return [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
+        """
+        :param attr_name: of the gymnasium environments
+        :param indices: of those that are asked, None for all
+        :return: the value in each of them
+        :raises NotImplementedError: if it shows or moves the state, which EnvPool keeps to itself
+        """
         if attr_name in _OF_THE_STATE:
             self._refuse(attr_name)
         return super().get_attr(attr_name, indices)
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
+        """
+        :param method_name: of ``Monitor``
+        :param args: of the method
+        :param indices: of the environments that are asked, None for all
+        :param kwargs: of the method
+        :return: what it returns in each of them
+        :raises NotImplementedError: if it is not one that ``Monitor`` adds to a wrapper's: it may have to know the state
+        """
         chosen = list(self._get_indices(indices))
         monitors = [self._monitors[env] for env in chosen]
         if hasattr(gym.Wrapper, method_name) or not all(hasattr(monitor, method_name) for monitor in monitors):

@@ -57,6 +57,11 @@ class MujocoVecEnv(BatchedVecEnv):
         self._controls = np.zeros((self.num_envs, frame_skip, model.nu))
 
     def step_async(self, actions: np.ndarray) -> None:
+        """
+        :param actions: of the action space, shape (N, ...)
+        :raises gymnasium.error.ResetNeeded: if there was no ``reset`` before
+        :raises ValueError: if the shape is wrong
+        """
         self._controls[:] = self.task.controls(self._check_actions(actions))[:, None]
 
     def step_wait(self) -> VecEnvStepReturn:

@@ -72,6 +72,7 @@ class Crew:
         """
         :param value: for all workers; it goes to each machine once
         :return: to be given as an argument in its place
+        :raises WorkersLostError: if Ray is gone
         """
         self._check_ray()
         return Shared(self._ray.put, value)

@@ -291,6 +291,8 @@ def env_on_workers(env: Any, n_workers: int) -> VecEnv:
     :param n_workers: number of workers
     :return: environments on workers
     :raises ValueError: if the number is out of range, or workers cannot make the environment
+    :raises ImportError: if Ray is not installed
+    :raises WorkersLostError: if Ray has no place for the workers
     """
     check_count("rollout_workers", n_workers)
     if isinstance(env, VecEnv) and isinstance(base := env.unwrapped, RayVecEnv):

@@ -32,7 +32,8 @@ _DEFAULT_EVAL_FREQ = 25_000
 
 def add_keys(manager: type, algo: str) -> None:
     """
-    Let an experiment manager understand the keys.
+    Let an experiment manager understand the keys. It raises a ``ValueError`` when it reads a value that is outside its domain,
+    or ``rollout_workers`` for another algorithm or beside subprocesses.
 
     :param manager: rl-zoo3's ``ExperimentManager``
     :param algo: name in rl-zoo3 of the algorithm whose batches workers can collect

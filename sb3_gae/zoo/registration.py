@@ -73,7 +73,11 @@ def default_hyperparams_path() -> Path:
 
 
 def register() -> None:
-    """Add the algorithm to rl-zoo3 by hand, where the start-up hook is off or cannot run."""
+    """
+    Add the algorithm to rl-zoo3 by hand, where the start-up hook is off or cannot run.
+
+    :raises UnsupportedZooError: if rl-zoo3 is not built as we expect
+    """
     for name in INTEGRATIONS:
         integrate(importlib.import_module(name))
 
@@ -83,6 +87,7 @@ def integrate(module: ModuleType) -> None:
     Add what belongs into one module of rl-zoo3.
 
     :param module: one of those named in ``INTEGRATIONS``
+    :raises UnsupportedZooError: if it is not built as we expect
     """
     INTEGRATIONS[module.__name__](module)
 
@@ -159,6 +164,7 @@ def _expect(module: ModuleType | type, name: str, kind: Any) -> Any:
     :param name: its name
     :param kind: what it should be an instance of
     :return: its value
+    :raises UnsupportedZooError: if it is missing or something else
     """
     value = getattr(module, name, None)
     if not isinstance(value, kind):

@@ -21,6 +21,7 @@ class HostGuard:
     :param app: to guard
     :param host: address that it listens at
     :param names: that it answers to besides localhost, addresses and, if it can be reached from elsewhere, this machine's name
+    :raises ValueError: if ``host`` is no address
     """
 
     def __init__(self, app: ASGIApp, host: str, names: Collection[str] = ()):
@@ -31,7 +32,13 @@ class HostGuard:
             self._names.add(socket.gethostname().lower())
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass on what is meant for this page."""
+        """
+        Pass on what is meant for this page, and refuse the rest.
+
+        :param scope: of the connection, as ASGI has it
+        :param receive: to be awaited for the next message
+        :param send: takes the messages of the answer
+        """
         if scope["type"] in ("http", "websocket"):
             reason = self.complaint(Headers(scope=scope))
             if reason:
