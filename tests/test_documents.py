@@ -1,12 +1,13 @@
 """What README and docs tell a user to type."""
 
 import re
+import shlex
 import sys
 from pathlib import Path
 
 import gymnasium
 import pytest
-from documented import DOCUMENTS, ROOT
+from documented import COMMANDS, DOCUMENTS, ROOT
 
 from sb3_gae.envs import TASKS
 from sb3_gae.sweep.cli import main
@@ -59,24 +60,37 @@ def test_tests_that_the_theory_names_are_there() -> None:
     assert not missing
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        "--from benchmarks/results/sweeps/fig2-left.parquet",
-        "--from benchmarks/results/sweeps/fig3-left.parquet",
-        "--from benchmarks/results/sweeps/fig3-right.parquet",
-        "--by last --from benchmarks/results/sweeps/fig4b.parquet",
-        "--from benchmarks/results/sweeps/value-targets-cart-pole.parquet",
-        "--from benchmarks/results/sweeps/lambda-auto-HalfCheetah-v5.parquet",
-        "--from benchmarks/results/sweeps/lambda-auto-Hopper-v5.parquet",
-    ],
-)
+def ranks() -> list[tuple[str, str]]:
+    """:return: folder and arguments of each command of the page that prints a table of a sweep's curves"""
+    found, folder = [], "."
+    for words in COMMANDS["paper-figures.md"]:
+        if words[0] == "cd":
+            folder = words[1]
+        elif words[1:4] == ["-m", "sb3_gae.sweep", "rank"]:
+            found.append((folder, shlex.join(words[3:])))
+    return found
+
+
+#: of which the page shows a figure, or the first lines, or what one line says
+WITHOUT_TABLE = {
+    "rank --by last --from benchmarks/results/sweeps/fig2-right.parquet",
+    "rank --from lambda-auto-cart-pole.parquet fig2-left.parquet",
+    "rank --from benchmarks/results/sweeps/lambda-rules-HalfCheetah-v5.parquet",
+    "rank --from benchmarks/results/sweeps/lambda-rules-Hopper-v5.parquet",
+    "rank --from lambda-auto-HalfCheetah-v5.parquet lambda-rules-HalfCheetah-v5.parquet --conditions trust_region",
+}
+TABLES = [(folder, command) for folder, command in ranks() if command not in WITHOUT_TABLE]
+
+
+def test_there_are_tables_of_sweeps() -> None:
+    assert len(TABLES) >= 14
+    assert {command for _, command in ranks()} >= WITHOUT_TABLE
+
+
+@pytest.mark.parametrize(("folder", "command"), TABLES)
 def test_tables_of_sweeps_are_what_the_command_prints(
-    arguments: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: str, command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(ROOT)
-    command = f"python -m sb3_gae.sweep rank {arguments}"
-    text = (ROOT / "docs" / "paper-figures.md").read_text()
-    assert f"{command}\n" in text
-    assert main(command.split()[3:]) == 0
-    assert capsys.readouterr().out in text
+    monkeypatch.chdir(ROOT / folder)
+    assert main(shlex.split(command)) == 0
+    assert capsys.readouterr().out in (ROOT / "docs" / "paper-figures.md").read_text()

@@ -216,7 +216,7 @@ def _mujoco_targets(runs: Runs) -> Iterable[list[str]]:
     yield ["no task under sb3-contrib's TRPO by more than the bands", ", ".join(under) or "none is", *_met(not under, fewest)]
     reaches = {task: time_to_reach(own) for task, own in runs.items()}
     parts = {task: reach.part for task, reach in reaches.items() if reach.is_learned}
-    slow = [f"{task} {part:.2f}" if math.isfinite(part) else f"{task} never" for task, part in parts.items() if part > 0.2]
+    slow = [f"{task} ({part:.2f})" if math.isfinite(part) else f"{task} (never)" for task, part in parts.items() if part > 0.2]
     yield [
         "its final return in a fifth of its time",
         "not on " + ", ".join(slow) if slow else "on all",
