@@ -22,12 +22,10 @@ _TOLERANCE = 1e-3
 class Watch:
     """
     :param model: whose updates are watched, see :func:`watched`
-    :param tolerance: part of its radius by which a step may exceed it
     """
 
-    def __init__(self, model: TRPOGAE, tolerance: float = _TOLERANCE):
+    def __init__(self, model: TRPOGAE):
         self.model = model
-        self.tolerance = tolerance
         #: steps by what they were and what became of them
         self.counts: Counter[str] = Counter()
         #: in words; none is what one hopes for
@@ -45,8 +43,7 @@ class Watch:
         self._expect(all(bool(tensor.isfinite().all()) for tensor in problem.parameters), f"{what}: not finite any more")
         divergence = self._divergence(what, old, self._state(batch.observations), batch.value_targets)
         self._expect(
-            divergence <= settings.radius * (1.0 + self.tolerance) + 1e-9,
-            f"{what}: {divergence} is more than {settings.radius}",
+            divergence <= settings.radius * (1.0 + _TOLERANCE) + 1e-9, f"{what}: {divergence} is more than {settings.radius}"
         )
         return record
 
@@ -71,13 +68,12 @@ class Watch:
 
 
 @contextmanager
-def watched(model: TRPOGAE, tolerance: float = _TOLERANCE) -> Iterator[Watch]:
+def watched(model: TRPOGAE) -> Iterator[Watch]:
     """
     :param model: that trains in the block
-    :param tolerance: part of its radius by which a step may exceed it
     :return: what was seen
     """
-    watch = Watch(model, tolerance)
+    watch = Watch(model)
     with ExitStack() as patches:
         for module in (sb3_gae.update.policy_step, sb3_gae.update.value_step):
             patches.enter_context(mock.patch.object(module, "trust_region_step", watch.step))
