@@ -47,6 +47,7 @@ _BEFORE_TUNING = {
 }
 
 _STD_SMALLER = {"policy_kwargs": "dict(log_std_init=-2)"}
+_MANY_JOINTS = _STD_SMALLER | {"target_kl": 0.03, "gae_lambda": 0.9}
 _STD_1 = {"policy_kwargs": "dict(log_std_init=0)"}
 
 #: settings that were tried on the seeds for tuning
@@ -69,12 +70,20 @@ CANDIDATES = {
         ("std-.14", "initial std e⁻²", _STD_SMALLER),
         ("std-.14-kl-.03", "initial std e⁻², KL 0.03", _STD_SMALLER | {"target_kl": 0.03}),
         ("std-.14-lambda-.9", "initial std e⁻², λ 0.9", _STD_SMALLER | {"gae_lambda": 0.9}),
-        ("std-.14-kl-.03-lambda-.9", "initial std e⁻², KL 0.03, λ 0.9", _STD_SMALLER | {"target_kl": 0.03, "gae_lambda": 0.9}),
+        ("std-.14-kl-.03-lambda-.9", "initial std e⁻², KL 0.03, λ 0.9", _MANY_JOINTS),
         (
             "std-.14-kl-.03-gamma-.95",
             "initial std e⁻², KL 0.03, γ 0.95, λ 0.9",
             _STD_SMALLER | {"target_kl": 0.03, "gamma": 0.95, "gae_lambda": 0.9},
         ),
+        ("std-.14-kl-.06-lambda-.9", "initial std e⁻², KL 0.06, λ 0.9", _MANY_JOINTS | {"target_kl": 0.06}),
+        ("std-.14-kl-.03-lambda-.9-small-batch", "… KL 0.03, batches of 1 024 steps", _MANY_JOINTS | {"n_steps": 128}),
+        (
+            "std-.14-kl-.03-lambda-.9-wide",
+            "… KL 0.03, two layers of 256 units",
+            _MANY_JOINTS | {"policy_kwargs": "dict(log_std_init=-2, net_arch=[256, 256])"},
+        ),
+        ("std-.14-kl-.03-lambda-.9-adam", "… KL 0.03, value function fitted by Adam", _MANY_JOINTS | _ADAM),
         ("std-.6", "initial std e^-½", {"policy_kwargs": "dict(log_std_init=-0.5)"}),
         ("std-1", "initial std 1", _STD_1),
         ("std-1-kl-.03", "initial std 1, KL 0.03", _STD_1 | {"target_kl": 0.03}),
