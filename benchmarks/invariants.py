@@ -64,7 +64,9 @@ class Watch:
             parts = [th.distributions.kl_divergence(one, other) for one, other in zip(old[0], new[0], strict=True)]
             return float(sum(part.reshape(len(part), -1).sum(dim=1).double().mean() for part in parts))
         variance = (old[1] - targets.double()).square().mean()
-        return float((new[1] - old[1]).square().mean() / (2.0 * variance))
+        change = (new[1] - old[1]).square().mean()
+        # Values that are their targets have no variance, and must not move
+        return float(change / (2.0 * variance)) if change > 0.0 else 0.0
 
 
 @contextmanager

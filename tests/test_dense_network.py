@@ -183,6 +183,17 @@ class MyLinear(nn.Linear):
     """Looks like a linear layer and need not act like one."""
 
 
+@pytest.mark.parametrize("scale", [1e-30, 1e-10, 1e-3, 0.1, 1.0])
+def test_outputs_in_single_precision_are_as_exact_as_torchs_whatever_their_size(scale: float) -> None:
+    """A rounding of 1 in each hidden unit would be all there is of small ones."""
+    doubles = layers_with(nn.Tanh(), [3, 4, 4, 2], bias=False)
+    inputs = inputs_for(9) * scale
+    exact = nn.Sequential(*doubles)(inputs).detach()
+    singles = [layer.float() for layer in doubles]
+    error = (DenseNetwork(singles, inputs.float()).forward().double() - exact).square().mean().sqrt()
+    assert error < 1e-5 * exact.square().mean().sqrt()
+
+
 class MyTanh(nn.Tanh):
     """Looks like tanh and need not act like it."""
 

@@ -103,7 +103,7 @@ def make_model(env: dict[str, Any], arguments: dict[str, Any], n_envs: int) -> T
 
 
 @pytest.mark.filterwarnings("ignore:overflow|invalid value|divide by zero")
-@settings(max_examples=80, derandomize=True)
+@settings(max_examples=80)
 @given(environments, arguments, st.integers(1, 3))
 def test_every_step_keeps_to_its_constraint_and_all_stays_finite(
     env: dict[str, Any], arguments: dict[str, Any], n_envs: int
@@ -111,9 +111,6 @@ def test_every_step_keeps_to_its_constraint_and_all_stays_finite(
     """Or the update says that a number is out of range, and has moved nothing."""
     model = make_model(env, arguments, n_envs)
     extreme = not 1e-15 <= abs(env["reward_scale"]) <= 1e15 or env["observation_scale"] < 1e-15
-    # Without normalization values are fitted to targets far from 1, and in single precision what is left of their differences,
-    # by which a step is measured, may be rounding
-    in_range = arguments["normalize_value"] or 1e-3 <= env["reward_scale"] <= 1e3
     with watched(model) as watch:
         for _ in range(2):
             before = state_of(model.policy)
@@ -125,7 +122,7 @@ def test_every_step_keeps_to_its_constraint_and_all_stays_finite(
                 assert differing(before, state_of(model.policy)) == []
                 return
             assert all(tensor.isfinite().all() for tensor in model.policy.state_dict().values())
-    assert [found for found in watch.violations if in_range or " is more than " not in found] == []
+    assert watch.violations == []
 
 
 @pytest.mark.parametrize("rewards", ["nothing", "constant"])

@@ -310,6 +310,21 @@ def test_without_an_error_there_is_no_step() -> None:
 
 
 @each_kind
+@pytest.mark.parametrize("reward_scale", [1e-10, 1.0, 1e10])
+def test_an_error_of_rounding_alone_is_not_fitted(kwargs: dict, reward_scale: float) -> None:
+    policy = double_policy(BOX, **kwargs)
+    with th.no_grad():
+        for parameter in policy.value_net.parameters():
+            parameter.mul_(reward_scale)
+    batch, rounding = training_batch(policy), th.finfo(th.float64).eps
+    values = values_of(policy, batch)
+    before = state_of(policy)
+    assert fit(policy, replace(batch, value_targets=values * (1.0 + rounding)), DAMPED).steps == []
+    assert not moved(before, policy)
+    assert fit(policy, replace(batch, value_targets=values * (1.0 + 1e4 * rounding)), DAMPED).steps != []
+
+
+@each_kind
 def test_no_steps_and_no_parameters_move_nothing(kwargs: dict) -> None:
     policy = double_policy(BOX, **kwargs)
     batch = training_batch(policy)

@@ -29,6 +29,9 @@ _TIMES_DERIVATIVE: dict[type[nn.Module], Callable[[Any, th.Tensor, th.Tensor], t
 # Rows that go through all layers together: few enough to stay in the cache, enough to keep the cores busy
 _BLOCK_ROWS = 8192
 
+# Mean square of a layer's outputs below which a rounding of 1 in their tanh would be seen in what is made of them
+_LEAST_SQUARE = 2.0**-12
+
 
 class DenseNetwork:
     """
@@ -184,10 +187,13 @@ class DenseNetwork:
 
 def _activate(activation: nn.Module, outputs: th.Tensor) -> th.Tensor:
     """The activation of fresh ``outputs``, which may be overwritten."""
-    if type(activation) is nn.Tanh and outputs.device.type == "cpu":
-        # tanh(x) = 2 sigmoid(2x) - 1 to a rounding of 1, in half the time of torch's kernel, the largest cost of a pass
-        return outputs.mul_(2.0).sigmoid_().mul_(2.0).sub_(1.0)
-    return activation(outputs)
+    if type(activation) is not nn.Tanh or outputs.device.type != "cpu":
+        return activation(outputs)
+    flat = outputs.view(-1)
+    if flat.dot(flat) < _LEAST_SQUARE * len(flat):
+        return outputs.tanh_()
+    # tanh(x) = 2 sigmoid(2x) - 1 to a rounding of 1, in half the time of torch's kernel, the largest cost of a pass
+    return outputs.mul_(2.0).sigmoid_().mul_(2.0).sub_(1.0)
 
 
 def _pair_up(layers: Sequence[nn.Module]) -> list[tuple[nn.Linear, nn.Module | None]]:

@@ -69,7 +69,8 @@ def value_steps(
     Fit the value function by up to ``n_steps`` trust-region steps, each measured from where it begins.
 
     Each solves the paper's problem (section 5) once, with :math:`V_{old}` and :math:`\sigma^2` taken anew.
-    The first step that is rejected is the last. With shared parameters it is the last that moves those, as is one that
+    The first step that is rejected is the last, and there is none where the values agree with their targets but for
+    rounding. With shared parameters it is the last that moves those, as is one that
     leaves no room: the value function's own may go on.
 
     :param policy: owner of the value function, in evaluation mode
@@ -101,7 +102,7 @@ def value_steps(
             joint, fit = None, make_fit(parameters)
         elif rejected:
             break
-        if fit.variance == 0.0 or not fit.parameters:
+        if fit.is_exact or not fit.parameters:
             break
         records.append(fit.step(settings) if joint is None else fit.step(settings, joint.step(fit.parameters, radius)))
     policy_kl = None if shared is None else shared.divergence()
@@ -225,6 +226,14 @@ class _Fit:
     def variance(self) -> float:
         r""":math:`\sigma^2` of the present values, in units of the squared value scale."""
         return (self.values - self._targets).square().mean().item()
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether all that is left between values and targets is rounding: a step would fit that."""
+        rounding = 4.0 * th.finfo(self._targets.dtype).eps
+        variance = self.variance
+        # Not <=, which an infinite target would pass
+        return variance == 0.0 or variance < rounding**2 * self.target_square
 
     def step(self, settings: TrustRegionSettings, shared: SharedStep | None = None) -> StepRecord:
         """One trust-region step from the present values."""
