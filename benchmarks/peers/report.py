@@ -16,6 +16,7 @@ PAGE = DOCS / "benchmarks.md"
 IMAGES = DOCS / "images"
 
 _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
+    "summary": tables.summary,
     "targets": tables.targets_table,
     "scores": tables.scores_table,
     "over tasks": tables.aggregate_table,
@@ -29,7 +30,7 @@ _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "origin": tables.origin_list,
 }
 #: sections that README has as well
-OF_README = ("scores",)
+OF_README = ("summary", "scores")
 #: preset that makes what a section needs, of those that would leave a chapter empty
 _PRESETS = {"classic": "classic", "three million": "mujoco-3m", "ablation": "ablation"}
 #: title of each figure, by the section of the page that it stands in

@@ -59,6 +59,25 @@ def aggregate_table(table: pd.DataFrame) -> str:
     return markdown_table(["", "runs × tasks", "IQM", "probability that ours is better", "IQM of ours / its own"], rows)
 
 
+def summary(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: in a sentence or two, how far ours is ahead over the MuJoCo tasks, and of how many runs that is said
+    """
+    runs = mujoco_runs(table)
+    if not runs:
+        return ""
+    scores = final_scores(runs)
+    means = interquartile_means(scores)
+    others = sorted((name for name in means if name != OURS), key=lambda name: -means[name].point)
+    factors = ", ".join(f"{_decimal(ratio(scores[OURS], scores[name]))} times that of {ALGORITHMS[name].title}" for name in others)
+    counts = ", ".join(f"{len(scores[name])} of {ALGORITHMS[name].title}" for name in (OURS, *others))
+    fewest = fewest_runs(own[name] for own in runs.values() for name in scores)
+    caution = "" if fewest >= FEW_SEEDS else " **Few runs, so little is said of chance.**"
+    tasks = f"Over {len(runs)} task{'s' * (len(runs) > 1)} the interquartile mean of ours is {factors}."
+    return f"{tasks} Runs on each task: {counts}.{caution}"
+
+
 def clock_table(table: pd.DataFrame) -> str:
     """
     :param table: of results
