@@ -142,7 +142,9 @@ def test_tables_say_what_the_results_say(sections: dict[str, str]) -> None:
 
 
 def test_the_summary_names_the_best_peer_first_and_how_many_runs_there_are(sections: dict[str, str]) -> None:
-    assert sections["summary"].startswith("Over 2 tasks the interquartile mean of ours is 1.50 [1.50, 1.50] times that of TRPO, ")
+    assert sections["summary"].startswith(
+        "Over 2 tasks the interquartile mean of ours is 1.50 [1.50, 1.50] times that of TRPO, "
+    )
     assert "2.00 [2.00, 2.00] times that of PPO, SB3. " in sections["summary"]
     assert sections["summary"].endswith("Runs on each task: 3 of TRPOGAE (ours), 3 of TRPO, sb3-contrib, 3 of PPO, SB3.")
     assert tables.summary(TABLE[TABLE["seed"] < 2]).endswith("**Few runs, so little is said of chance.**")

@@ -70,7 +70,9 @@ def summary(table: pd.DataFrame) -> str:
     scores = final_scores(runs)
     means = interquartile_means(scores)
     others = sorted((name for name in means if name != OURS), key=lambda name: -means[name].point)
-    factors = ", ".join(f"{_decimal(ratio(scores[OURS], scores[name]))} times that of {ALGORITHMS[name].title}" for name in others)
+    factors = ", ".join(
+        f"{_decimal(ratio(scores[OURS], scores[name]))} times that of {ALGORITHMS[name].title}" for name in others
+    )
     counts = ", ".join(f"{len(scores[name])} of {ALGORITHMS[name].title}" for name in (OURS, *others))
     fewest = fewest_runs(own[name] for own in runs.values() for name in scores)
     caution = "" if fewest >= FEW_SEEDS else " **Few runs, so little is said of chance.**"
