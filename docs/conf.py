@@ -60,4 +60,4 @@ intersphinx_mapping = {
 html_theme = "furo"
 html_title = f"sb3-gae {version}"
 html_static_path = ["_static"]
-html_css_files = ["pictures.css"]
+html_css_files = ["book.css"]
