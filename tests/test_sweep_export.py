@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 from sweep_table import CELLS, fill, refusal
 
-from sb3_gae.sweep import SweepError, SweepStudy, export, read_results, results_of, select
+from sb3_gae.sweep import Selection, SweepError, SweepStudy, export, read_results, results_of
 from sb3_gae.sweep.cli import main
 from sb3_gae.sweep.export import SUFFIXES
 from sb3_gae.sweep.ledger import Outcome
@@ -119,7 +119,7 @@ def test_what_is_not_finished_is_exported_if_asked_for(
     finished = results_of(unfinished)
     assert "state" not in finished and len(finished) == 4
     pd.testing.assert_frame_equal(read_results(path), finished)
-    pd.testing.assert_frame_equal(select(table), finished)
+    pd.testing.assert_frame_equal(Selection().of(table), finished)
     assert take_in(SweepStudy("other", str(tmp_path / "other.journal")), table) == 1
     # Nor is it lost
     said = refusal(*export_command, capsys=capsys)

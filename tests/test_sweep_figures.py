@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 from sweep_table import CURVES
 
-from sb3_gae.sweep import Curve, draw, select
+from sb3_gae.sweep import Curve, Selection, draw
 from sb3_gae.sweep.figures.curves import curves_figure
 from sb3_gae.sweep.figures.heatmap import heatmap_figure
 from sb3_gae.sweep.figures.lambda_curve import lambda_figure
@@ -31,7 +31,7 @@ def test_curves_have_a_band_and_a_legend(sweep_table: pd.DataFrame) -> None:
 
 
 def test_few_runs_have_a_mean(sweep_table: pd.DataFrame) -> None:
-    chosen = select(sweep_table, gammas=[0.9])
+    chosen = Selection(gammas=[0.9]).of(sweep_table)
     for count, shown in ((4, "IQM over 4 seeds"), (3, "mean over 3 seeds"), (1, "mean over 1 seed,")):
         some = chosen[chosen["seed"] < count]
         assert shown in texts(curves_figure(some)) and shown in texts(lambda_figure(some))
@@ -41,7 +41,7 @@ def test_few_runs_have_a_mean(sweep_table: pd.DataFrame) -> None:
 
 
 def test_curves_say_where_episodes_ended_if_that_is_rare(sweep_table: pd.DataFrame) -> None:
-    chosen = select(sweep_table, gammas=[0.9], lambdas=[0.5], conditions=["trust_region"])
+    chosen = Selection(gammas=[0.9], lambdas=[0.5], conditions=["trust_region"]).of(sweep_table)
     figure = curves_figure(chosen)  # in three iterations of four
     assert figure.axes[0].lines[0].get_marker() == "None" and "dots" not in texts(figure)
     rare = chosen.assign(mean_return=chosen["mean_return"].where(chosen["iteration"] == 3))
@@ -53,7 +53,7 @@ def test_curves_say_where_episodes_ended_if_that_is_rare(sweep_table: pd.DataFra
 
 
 def test_heatmap_frames_the_best_cell(sweep_table: pd.DataFrame) -> None:
-    figure = heatmap_figure(select(sweep_table, conditions=["trust_region"]))
+    figure = heatmap_figure(Selection(conditions=["trust_region"]).of(sweep_table))
     axes = figure.axes[0]
     (frame,) = axes.patches
     assert (frame.get_x(), frame.get_y()) == (1, 1)  # type: ignore[attr-defined]
@@ -67,7 +67,7 @@ def test_heatmap_frames_the_best_cell(sweep_table: pd.DataFrame) -> None:
 
 
 def test_lambda_curve_is_a_u(sweep_table: pd.DataFrame) -> None:
-    figure = lambda_figure(select(sweep_table, gammas=[0.9]))
+    figure = lambda_figure(Selection(gammas=[0.9]).of(sweep_table))
     lost = np.asarray(figure.axes[0].lines[0].get_ydata())
     assert lost[1] == 0.0 and lost[0] > 0.0 < lost[2]
     assert "no value function" in texts(figure)

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from sweep_table import CELLS, mean_return
 
-from sb3_gae.sweep import Cell, Curve, SweepError, draw, select
+from sb3_gae.sweep import Cell, Curve, Selection, SweepError, draw
 from sb3_gae.sweep.results import rows_of_cells
 from sb3_gae.sweep.series import series_of
 
@@ -32,13 +32,17 @@ def test_series_are_in_order_and_bridge_iterations_without_an_episode(sweep_tabl
 @pytest.mark.parametrize(
     ("kind", "arguments", "message"),
     [
-        ("curves", {"gammas": [0.5]}, "no finished cell has gamma 0.5; there are 0.9, 1"),
-        ("curves", {"tasks": ["Acrobot-v1"]}, "no finished cell has task Acrobot-v1; there are CartPole-v1"),
-        ("curves", {"iterations": 9}, "no finished cell has iterations 9; there are 4"),
-        ("heatmap", {"conditions": ["no_vf"]}, "one condition that has a λ, and the selection has none"),
+        ("curves", {"selection": Selection(gammas=[0.5])}, "no finished cell has gamma 0.5; there are 0.9, 1"),
+        (
+            "curves",
+            {"selection": Selection(tasks=["Acrobot-v1"])},
+            "no finished cell has task Acrobot-v1; there are CartPole-v1",
+        ),
+        ("curves", {"selection": Selection(iterations=9)}, "no finished cell has iterations 9; there are 4"),
+        ("heatmap", {"selection": Selection(conditions=["no_vf"])}, "one condition that has a λ, and the selection has none"),
         ("heatmap", {"iteration": 5}, "`iteration` must be from 1 to 4"),
         ("lambda", {}, "at one γ, and the selection has 0.9, 1"),
-        ("lambda", {"gammas": [0.9], "lambdas": [0.5]}, "needs at least two λ"),
+        ("lambda", {"selection": Selection(gammas=[0.9], lambdas=[0.5])}, "needs at least two λ"),
         ("curves", {"output": "out.pdf"}, "`output` must end in .png or .svg, or have no ending for both, got 'out.pdf'"),
         ("curves", {"output": "out.SVG"}, "`output` must end in .png or .svg"),
         ("pie", {}, "`figure` knows curves, heatmap, lambda"),
@@ -55,10 +59,10 @@ def test_empty_and_mixed_selections(
 
 def test_a_lambda_that_no_cell_has_is_said_though_there_are_cells_without_one(sweep_table: pd.DataFrame) -> None:
     with pytest.raises(SweepError, match=r"no finished cell has gae_lambda 0\.25, 0\.75; there are 0, 0\.5, 1\.$"):
-        select(sweep_table, lambdas=(value for value in (0.25, 0.75)))
+        Selection(lambdas=(value for value in (0.25, 0.75))).of(sweep_table)
     with pytest.raises(SweepError, match=r"no finished cell has gae_lambda 0\.5; there is none\.$"):
-        select(sweep_table, conditions=["no_vf"], lambdas=[0.5])
-    chosen = select(sweep_table, lambdas=iter([0.5]))
+        Selection(conditions=["no_vf"], lambdas=[0.5]).of(sweep_table)
+    chosen = Selection(lambdas=iter([0.5])).of(sweep_table)
     assert set(chosen["condition"]) == {"trust_region", "no_vf"}
     assert set(chosen["gae_lambda"].dropna()) == {0.5}
 
@@ -67,7 +71,7 @@ def test_runs_of_different_lengths_are_not_mixed(sweep_table: pd.DataFrame, tmp_
     both = pd.concat([sweep_table, sweep_table[sweep_table["iteration"] <= 2].assign(iterations=2)])
     with pytest.raises(SweepError, match=r"iterations differ \(2, 4\); choose one with --of-iterations"):
         draw("curves", both, tmp_path / "figure")
-    assert len(select(both, iterations=4)) == len(sweep_table)
+    assert len(Selection(iterations=4).of(both)) == len(sweep_table)
     with pytest.raises(SweepError, match="No cell has finished yet"):
         draw("curves", sweep_table[:0], tmp_path / "figure")
 

@@ -10,7 +10,8 @@ from sb3_gae.sweep.export import export
 from sb3_gae.sweep.figures import draw
 from sb3_gae.sweep.grid import Cell, Curve
 from sb3_gae.sweep.presets import PRESETS
-from sb3_gae.sweep.results import read_results, results_of, select
+from sb3_gae.sweep.results import read_results, results_of
+from sb3_gae.sweep.selection import Selection
 from sb3_gae.sweep.study import SweepStudy
 from sb3_gae.sweep.sweep import run_sweep
 
@@ -19,6 +20,7 @@ __all__ = [
     "PRESETS",
     "Cell",
     "Curve",
+    "Selection",
     "SweepError",
     "SweepStudy",
     "draw",
@@ -26,5 +28,4 @@ __all__ = [
     "read_results",
     "results_of",
     "run_sweep",
-    "select",
 ]

@@ -10,6 +10,7 @@ from sb3_gae.sweep.errors import SweepError, in_one_line
 from sb3_gae.sweep.figures import KINDS
 from sb3_gae.sweep.liveness import SILENT_AFTER
 from sb3_gae.sweep.presets import PRESETS
+from sb3_gae.sweep.selection import Selection
 from sb3_gae.sweep.series import SCORES
 
 _EXAMPLES = """examples:
@@ -151,15 +152,9 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--of-iterations", type=int, help="only runs of this length")
 
 
-def selection_of(args: argparse.Namespace) -> dict[str, Any]:
+def selection_of(args: argparse.Namespace) -> Selection:
     """
     :param args: of the commands ``figure`` and ``rank``
-    :return: arguments of :func:`~sb3_gae.sweep.results.select`
+    :return: what they choose of a table
     """
-    return {
-        "tasks": args.env,
-        "conditions": args.conditions,
-        "gammas": args.gammas,
-        "lambdas": args.lambdas,
-        "iterations": args.of_iterations,
-    }
+    return Selection(args.env, args.conditions, args.gammas, args.lambdas, args.of_iterations)

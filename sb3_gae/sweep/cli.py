@@ -4,7 +4,6 @@ import argparse
 import importlib.util
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -19,7 +18,7 @@ from sb3_gae.sweep.machine import check_jobs
 from sb3_gae.sweep.plan import Options, Plan, check_seeds, default_name, make_cells
 from sb3_gae.sweep.presets import find_preset
 from sb3_gae.sweep.report import failures, overview, running
-from sb3_gae.sweep.results import NO_PARQUET, is_selected, read_results, results_of, select
+from sb3_gae.sweep.results import NO_PARQUET, read_results, results_of
 from sb3_gae.sweep.runner import check_plan, run_plan, standings_of
 from sb3_gae.sweep.runs import combine, runs_of
 from sb3_gae.sweep.storage import holds
@@ -140,14 +139,14 @@ def _import(args: argparse.Namespace) -> int:
 def _figure(args: argparse.Namespace) -> int:
     table, name = _results_of(args)
     output = args.output or f"logs/sweeps/{name}_{args.kind}"
-    for path in draw(args.kind, table, output, args.iteration, args.by, **selection_of(args)):
+    for path in draw(args.kind, table, output, args.iteration, args.by, selection_of(args)):
         print(f"wrote {path}")
     return 0
 
 
 def _rank(args: argparse.Namespace) -> int:
     table, _ = _results_of(args)
-    chosen = select(table, **selection_of(args))
+    chosen = selection_of(args).of(table)
     # Every process of a sweep would wait for rliable
     from sb3_gae.sweep.ranking import as_markdown, caution, rank_curves
 
@@ -165,7 +164,7 @@ def _results_of(args: argparse.Namespace) -> tuple[pd.DataFrame, str]:
         if args.storage is not None or args.name is not None or args.preset is not None:
             raise SweepError("`from` names files; leave out --storage, --name and --preset, or --from.")
         tables = ((file, read_results(file)) for file in args.sources)
-        table = combine(tables, matters=partial(is_selected, **selection_of(args)))
+        table = combine(tables, matters=selection_of(args).has)
         return table, Path(args.sources[0]).name.split(".")[0]
     study = _study_of(args)
     return results_of(study), study.name

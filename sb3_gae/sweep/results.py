@@ -9,7 +9,6 @@ from typing import Any
 import pandas as pd
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_gae.sweep.agreement import check_alike, made_in
 from sb3_gae.sweep.errors import SweepError, in_one_line
 from sb3_gae.sweep.grid import Cell
 from sb3_gae.sweep.ledger import Outcome, Status, standings
@@ -140,101 +139,6 @@ def _typed(table: pd.DataFrame) -> pd.DataFrame:
     types |= dict.fromkeys(_COUNT_COLUMNS, "int64") | dict.fromkeys(_TEXT_COLUMNS, object)
     table = table[[*COLUMNS, *([STATE_COLUMN] if STATE_COLUMN in table else [])]]
     return table.fillna(dict.fromkeys(_TEXT_COLUMNS, "")).astype(types)
-
-
-def select(
-    table: pd.DataFrame,
-    *,
-    tasks: Iterable[str] | None = None,
-    conditions: Iterable[str] | None = None,
-    gammas: Iterable[float] | None = None,
-    lambdas: Iterable[float] | None = None,
-    iterations: int | None = None,
-) -> pd.DataFrame:
-    """
-    :param table: of results; of partial ones those of finished cells count
-    :param tasks: to keep; None for all, as below
-    :param conditions: to keep
-    :param gammas: to keep
-    :param lambdas: to keep, beside cells of conditions without λ
-    :param iterations: of the cells to keep
-    :return: one task's rows, with runs of one length, one set of overrides, and one of settings
-    :raises SweepError: if nothing is left, or several kinds are left that do not go together
-    """
-    table = finished(table)
-    if table.empty:
-        raise SweepError("No cell has finished yet; see: python -m sb3_gae.sweep status")
-    for column, chosen in _wanted(tasks, conditions, gammas, lambdas, iterations).items():
-        if not table[column].isin(chosen).any():
-            held = sorted(table[column].dropna().unique())
-            there = f"there are {_listed(held)}" if held else "there is none"
-            raise SweepError(f"The selection is empty: no finished cell has {column} {_listed(chosen)}; {there}.")
-        table = table[_keeps(table, column, chosen)]
-    for column, option in {
-        "task": "--env",
-        "iterations": "--of-iterations",
-        "overrides": "--from a file of one of them",
-    }.items():
-        found = sorted(table[column].unique())
-        if len(found) > 1:
-            shown = ", ".join(map(_shown, found))
-            raise SweepError(f"The selection mixes runs whose {column} differ ({shown}); choose one with {option}.")
-    check_alike(made_in(table), "leave out one of the files, or choose other --conditions, --gammas or --lambdas")
-    return table
-
-
-def is_selected(
-    run: pd.DataFrame,
-    *,
-    tasks: Iterable[str] | None = None,
-    conditions: Iterable[str] | None = None,
-    gammas: Iterable[float] | None = None,
-    lambdas: Iterable[float] | None = None,
-    iterations: int | None = None,
-) -> bool:
-    """
-    :param run: rows of one run
-    :param tasks: as in :func:`select`, and so are the others
-    :param conditions: to keep
-    :param gammas: to keep
-    :param lambdas: to keep
-    :param iterations: of the cells to keep
-    :return: whether it would be kept
-    """
-    wanted = _wanted(tasks, conditions, gammas, lambdas, iterations)
-    return all(_keeps(run, column, chosen).all() for column, chosen in wanted.items())
-
-
-def _wanted(
-    tasks: Iterable[str] | None,
-    conditions: Iterable[str] | None,
-    gammas: Iterable[float] | None,
-    lambdas: Iterable[float] | None,
-    iterations: int | None,
-) -> dict[str, list[Any]]:
-    """:return: the values to keep of each column of which some are to be kept"""
-    wanted = {
-        "task": tasks,
-        "condition": conditions,
-        "gamma": gammas,
-        "gae_lambda": lambdas,
-        "iterations": None if iterations is None else [iterations],
-    }
-    return {column: list(values) for column, values in wanted.items() if values is not None}
-
-
-def _keeps(table: pd.DataFrame, column: str, chosen: list[Any]) -> "pd.Series[bool]":
-    """:return: for each row, whether it is kept; a condition without λ has none to choose by"""
-    kept = table[column].isin(chosen)
-    return kept | table[column].isna() if column == "gae_lambda" else kept
-
-
-def _listed(values: Iterable[Any]) -> str:
-    return ", ".join(map(_shown, values))
-
-
-def _shown(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def identities(table: pd.DataFrame) -> set[tuple[Any, ...]]:
