@@ -78,6 +78,16 @@ CANDIDATES = {
         ),
         ("std-.14-kl-.06-lambda-.9", "initial std e⁻², KL 0.06, λ 0.9", _MANY_JOINTS | {"target_kl": 0.06}),
         (
+            "std-.14-kl-.06-lambda-.9-large-batch",
+            "initial std e⁻², KL 0.06, λ 0.9, batches of 4 096 steps",
+            _MANY_JOINTS | {"target_kl": 0.06, "n_steps": 512},
+        ),
+        (
+            "std-.14-kl-.1-lambda-.9-large-batch",
+            "initial std e⁻², KL 0.1, λ 0.9, batches of 4 096 steps",
+            _MANY_JOINTS | {"target_kl": 0.1, "n_steps": 512},
+        ),
+        (
             "std-.14-kl-.03-lambda-.9-small-batch",
             "initial std e⁻², KL 0.03, λ 0.9, batches of 1 024 steps",
             _MANY_JOINTS | {"n_steps": 128},
