@@ -6,7 +6,7 @@ from typing import NamedTuple
 from benchmarks.peers.algorithms import A2C, OURS, PPO, TIANSHOU_NPG, TIANSHOU_TRPO, TRPO
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, MUJOCO_TASKS, PUBLISHED_PPO
-from benchmarks.peers.variants import CANDIDATES, SHIPPED, VARIANTS
+from benchmarks.peers.variants import CANDIDATES, PENDULUM_CANDIDATES, SHIPPED, VARIANTS
 
 #: of ours and of the peers that the targets name
 SEEDS = 5
@@ -20,6 +20,9 @@ SMOKE_STEPS = 2_000
 TUNING_SEEDS = (100, 101, 102)
 TUNING_TASKS = ("Walker2d-v5", "Hopper-v5", "HalfCheetah-v5", "Ant-v5", "Swimmer-v5", "Humanoid-v5")
 TUNING_STEPS = 500_000
+PENDULUM = "Pendulum-v1"
+#: as many as tell a tenth of the return from chance
+PENDULUM_TUNING_SEEDS = range(100, 106)
 
 
 class Cell(NamedTuple):
@@ -92,6 +95,12 @@ def _tuning(steps: int) -> Iterator[Cell]:
                 yield Cell(task, OURS, variant, seed, steps)
 
 
+def _pendulum() -> Iterator[Cell]:
+    for seed in PENDULUM_TUNING_SEEDS:
+        for variant in PENDULUM_CANDIDATES:
+            yield Cell(PENDULUM, OURS, variant, seed, CLASSIC_TASKS[PENDULUM])
+
+
 def _mujoco() -> Iterator[Cell]:
     tasks = dict.fromkeys(MUJOCO_TASKS, MUJOCO_STEPS)
     first = {OURS: SEEDS, TRPO: SEEDS, PPO: SEEDS}
@@ -107,5 +116,6 @@ PRESETS: dict[str, tuple[Cell, ...]] = {
     "tuning": tuple(_tuning(TUNING_STEPS)),
     # What learns sooner need not end higher
     "tuning-long": tuple(_tuning(MUJOCO_STEPS)),
+    "tuning-pendulum": tuple(_pendulum()),
     "smoke": tuple(_seed_major({"CartPole-v1": SMOKE_STEPS}, {OURS: 1, TRPO: 1})),
 }

@@ -19,9 +19,9 @@ from benchmarks.peers.comparison import (
 )
 from benchmarks.peers.curves import Run, all_runs, runs_of, scores_of
 from benchmarks.peers.page import markdown_table
-from benchmarks.peers.plan import ABLATION_TASKS, CLASSIC_SEEDS, FEW_SEEDS, SEEDS, TUNING_STEPS, TUNING_TASKS
+from benchmarks.peers.plan import ABLATION_TASKS, CLASSIC_SEEDS, FEW_SEEDS, PENDULUM, SEEDS, TUNING_STEPS, TUNING_TASKS
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, PUBLISHED_PPO
-from benchmarks.peers.variants import CANDIDATES, VARIANTS
+from benchmarks.peers.variants import CANDIDATES, PENDULUM_CANDIDATES, VARIANTS
 from sb3_gae.sweep.statistics import interquartile_mean
 
 #: parts of sb3-contrib TRPO's training time at which scores are compared
@@ -183,6 +183,18 @@ def long_tuning_table(table: pd.DataFrame) -> str:
     :return: the same of runs of the full length
     """
     return _tried(table, MUJOCO_STEPS)
+
+
+def pendulum_tuning_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: score of the settings that were tried on Pendulum-v1
+    """
+    found = {
+        about.title: runs_of(table, PENDULUM, OURS, CLASSIC_TASKS[PENDULUM], variant)
+        for variant, about in PENDULUM_CANDIDATES.items()
+    }
+    return markdown_table(["", PENDULUM], [[title, _score(runs)] for title, runs in found.items() if runs])
 
 
 def _tried(table: pd.DataFrame, steps: int) -> str:

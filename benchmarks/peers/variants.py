@@ -123,3 +123,25 @@ CANDIDATES = {
         ),
     )
 }
+
+_PENDULUM = {"n_envs": 8, "n_steps": 128, "gamma": 0.9, "gae_lambda": 0.95, "target_kl": 0.01, "use_sde": False}
+# Two environments as the zoo has for trpo
+_SDE = {"use_sde": True, "sde_sample_freq": 4}
+_SDE_TWO_ENVS = _SDE | {"n_envs": 2, "n_steps": 1024}
+
+#: settings that were tried on Pendulum-v1, where a run takes seconds
+PENDULUM_CANDIDATES = {
+    f"try-pendulum-{name}": Variant(title, _PENDULUM | overrides)
+    for name, title, overrides in (
+        ("first", "as before tuning: 8 × 128 steps, KL 0.01, λ 0.95", {}),
+        ("sde", "gSDE, a new noise matrix every four steps", _SDE),
+        ("sde-kl-.03", "gSDE, KL 0.03", _SDE | {"target_kl": 0.03}),
+        ("sde-kl-.03-batch-2048", "gSDE, KL 0.03, 8 × 256 steps", _SDE | {"target_kl": 0.03, "n_steps": 256}),
+        ("sde-batch-512", "gSDE, 8 × 64 steps", _SDE | {"n_steps": 64}),
+        ("sde-two-envs", "gSDE, 2 × 1 024 steps", _SDE_TWO_ENVS),
+        ("sde-two-envs-kl-.03", "gSDE, 2 × 1 024 steps, KL 0.03", _SDE_TWO_ENVS | {"target_kl": 0.03}),
+        ("sde-two-envs-1024", "gSDE, 2 × 512 steps", _SDE | {"n_envs": 2, "n_steps": 512}),
+        ("sde-lambda-.9", "gSDE, λ 0.9", _SDE | {"gae_lambda": 0.9}),
+        ("sde-lambda-.99", "gSDE, λ 0.99", _SDE | {"gae_lambda": 0.99}),
+    )
+}
