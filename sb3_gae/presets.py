@@ -16,7 +16,7 @@ PAPER_LAMBDAS = (0.0, 0.36, 0.68, 0.84, 0.92, 0.96, 0.98, 0.99, 1.0)
 #: ``policy_kwargs`` of the paper's cart-pole: a linear policy, a value network of 20 tanh units (section 6.2.1)
 CARTPOLE_NETWORKS: dict[str, Any] = dict(net_arch=dict(pi=[], vf=[20]), activation_fn=nn.Tanh)
 
-#: ``policy_kwargs`` of the paper's robots: 100, 50 and 25 tanh units for policy and value function (section 6.2.2)
+#: ``policy_kwargs`` of the paper's robots: 100, 50 and 25 tanh units for policy and value function (section 6.2.1)
 LOCOMOTION_NETWORKS: dict[str, Any] = dict(net_arch=dict(pi=[100, 50, 25], vf=[100, 50, 25]), activation_fn=nn.Tanh)
 
 #: the value fit of section 5: Monte-Carlo targets, and one trust-region step a batch. Meant for the paper's batches of

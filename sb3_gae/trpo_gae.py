@@ -82,7 +82,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
     :param rollout_buffer_kwargs: passed to the rollout buffer
     :param normalize_advantage: whether to shift and scale the advantages of a batch to mean 0 and deviation 1
     :param target_kl: largest mean KL divergence of a policy step, in nats
-    :param sub_sampling_factor: use every so many samples, at random, for the policy step
+    :param sub_sampling_factor: the policy step uses one in this many samples, drawn at random
     :param stats_window_size: episodes to average in the logs
     :param tensorboard_log: directory for TensorBoard (None: no logging)
     :param policy_kwargs: passed to the policy; :data:`~sb3_gae.presets.LOCOMOTION_NETWORKS` and
@@ -246,6 +246,7 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
             raise ValueError("The policy has no trainable parameters; give it layers, or unfreeze them.")
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
+        # SB3's own default is the name of its class, which no policy of ours has
         super()._maybe_recommend_cpu(mlp_class_name)
 
     def collect_rollouts(  # type: ignore[override]

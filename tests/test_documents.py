@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import gymnasium
+import matplotlib
 import pytest
 from documented import COMMANDS, DOCUMENTS, ROOT
 
@@ -94,3 +95,39 @@ def test_tables_of_sweeps_are_what_the_command_prints(
     monkeypatch.chdir(ROOT / folder)
     assert main(shlex.split(command)) == 0
     assert capsys.readouterr().out in (ROOT / "docs" / "paper-figures.md").read_text()
+
+
+def figures() -> list[tuple[str, str, str]]:
+    """:return: name of each picture of the page of sweeps, with the folder and the arguments of the command that draws it"""
+    page = (ROOT / "docs" / "paper-figures.md").read_text().replace("\\\n", " ")
+    found, waiting, folder = [], [], "."
+    for image, fence, target, command in re.findall(
+        r"\]\(images/(\w+)\.svg\)|^(```bash)$|^cd (.+)$|^python -m sb3_gae\.sweep (figure .+)$", page, re.MULTILINE
+    ):
+        if image:
+            waiting.append(image)
+        elif fence:
+            folder = "."
+        elif target:
+            folder = target
+        else:
+            found.append((waiting.pop(0), folder, command))
+    assert not waiting, f"no command draws {waiting}"
+    return found
+
+
+def test_there_are_figures_of_sweeps() -> None:
+    assert len(figures()) >= 11
+
+
+@pytest.mark.parametrize(("name", "folder", "command"), figures())
+def test_figures_of_sweeps_are_what_the_command_draws(
+    name: str, folder: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    committed = (ROOT / "docs" / "images" / f"{name}.svg").read_text()
+    if f"Matplotlib v{matplotlib.__version__}," not in committed:
+        pytest.skip("another matplotlib, which may draw the same in other words")
+    monkeypatch.chdir(ROOT / folder)
+    drawn = tmp_path / "figure.svg"
+    assert main([*shlex.split(command), "--output", str(drawn)]) == 0
+    assert drawn.read_text() == committed

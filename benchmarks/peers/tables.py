@@ -1,8 +1,9 @@
 """Markdown of the results page."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping
 
+import numpy as np
 import pandas as pd
 
 from benchmarks.peers.aggregates import Interval, improvement, interquartile_means, normalized, ratio
@@ -50,9 +51,9 @@ def aggregate_table(table: pd.DataFrame) -> str:
         [
             ALGORITHMS[name].title,
             f"{len(scores[name])} × {len(runs)}",
-            _decimal(mean),
-            "" if name == OURS else _decimal(improvement(scores[OURS], scores[name])),
-            "" if name == OURS else _decimal(ratio(scores[OURS], scores[name])),
+            _decimal(mean, len(scores[name])),
+            "" if name == OURS else _against_ours(improvement, scores, name),
+            "" if name == OURS else _against_ours(ratio, scores, name),
         ]
         for name, mean in interquartile_means(scores).items()
     ]
@@ -70,14 +71,16 @@ def summary(table: pd.DataFrame) -> str:
     scores = final_scores(runs)
     means = interquartile_means(scores)
     others = sorted((name for name in means if name != OURS), key=lambda name: -means[name].point)
-    factors = ", ".join(
-        f"{_decimal(ratio(scores[OURS], scores[name]))} times that of {ALGORITHMS[name].title}" for name in others
-    )
-    counts = ", ".join(f"{len(scores[name])} of {ALGORITHMS[name].title}" for name in (OURS, *others))
+    factors = " and ".join(f"{_against_ours(ratio, scores, name)} times that of {_short(name)}" for name in others)
+    counts = ", ".join(f"{_short(name)} {len(scores[name])}" for name in (OURS, *others))
     fewest = fewest_runs(own[name] for own in runs.values() for name in scores)
     caution = "" if fewest >= FEW_SEEDS else " **Few runs, so little is said of chance.**"
-    tasks = f"Over {len(runs)} task{'s' * (len(runs) > 1)} the interquartile mean of ours is {factors}."
+    tasks = f"Over {len(runs)} task{'s' * (len(runs) > 1)} the interquartile mean of {_short(OURS)} is {factors}."
     return f"{tasks} Runs on each task: {counts}.{caution}"
+
+
+def _short(name: str) -> str:
+    return ALGORITHMS[name].title.split(" (")[0].split(",")[0]
 
 
 def clock_table(table: pd.DataFrame) -> str:
@@ -92,8 +95,10 @@ def clock_table(table: pd.DataFrame) -> str:
     means = {title: interquartile_means(scores) for title, scores in found.items()}
     rows = []
     for name in common_algorithms(runs):
-        better = ["" if name == OURS else _decimal(improvement(scores[OURS], scores[name])) for scores in found.values()]
-        cells = [part for title, chance in zip(found, better, strict=True) for part in (_decimal(means[title][name]), chance)]
+        cells = []
+        for title, scores in found.items():
+            cells.append(_decimal(means[title][name], len(scores[name])))
+            cells.append("" if name == OURS else _against_ours(improvement, scores, name))
         rows.append([ALGORITHMS[name].title, *cells])
     heads = [head for title in FRACTIONS for head in (f"IQM after {title}", "ours is better")]
     return markdown_table(["", *heads], rows)
@@ -210,7 +215,8 @@ def _against(own: dict[str, list[Run]], shipped: dict[str, list[Run]]) -> str:
     if not all(own.values()):
         return ""
     scores = [scores_of(runs) for runs in own.values()]
-    return _decimal(interquartile_means({"": normalized(scores, [scores_of(runs) for runs in shipped.values()])})[""])
+    mean = interquartile_means({"": normalized(scores, [scores_of(runs) for runs in shipped.values()])})[""]
+    return _decimal(mean, fewest_runs([*own.values(), *shipped.values()]))
 
 
 def targets_table(table: pd.DataFrame) -> str:
@@ -244,7 +250,7 @@ def _mujoco_targets(runs: Runs) -> Iterable[list[str]]:
     fewest = fewest_runs(own[name] for own in runs.values() for name in (OURS, TRPO))
     of_all = fewest_runs(own[name] for own in runs.values() for name in scores)
     target = "IQM over tasks at least 1.3 times the best peer's"
-    yield [target, f"{_decimal(factor)} ({title})", *_met(factor.point >= 1.3, of_all, FEW_SEEDS)]
+    yield [target, f"{_decimal(factor, of_all)} ({title})", *_met(factor.point >= 1.3, of_all, FEW_SEEDS)]
     under = [task for task, own in runs.items() if verdict(own) == "no"]
     yield ["no task under sb3-contrib's TRPO by more than the bands", ", ".join(under) or "none is", *_met(not under, fewest)]
     reaches = {task: time_to_reach(own) for task, own in runs.items()}
@@ -296,15 +302,19 @@ def number(value: float) -> str:
 def _score(runs: list[Run] | None) -> str:
     if not runs:
         return ""
-    if len(runs) == 1:
-        return f"{number(float(interquartile_mean(scores_of(runs))))} (1 run)"
+    if len(runs) < FEW_SEEDS:
+        return f"{number(float(interquartile_mean(scores_of(runs))))} ({len(runs)} run{'s' * (len(runs) > 1)})"
     found = score(runs)
     return f"{number(found.point)} [{number(found.low)}, {number(found.high)}] ({len(runs)})"
 
 
-def _decimal(interval: Interval) -> str:
-    # A single run has no interval
-    return f"{interval.point:.2f}" + f" [{interval.low:.2f}, {interval.high:.2f}]" * (interval.low < interval.high)
+def _decimal(interval: Interval, n_runs: int) -> str:
+    """The interval as well, where there are runs enough behind it for one: of one or two it would say nothing of chance."""
+    return f"{interval.point:.2f}" + f" [{interval.low:.2f}, {interval.high:.2f}]" * (n_runs >= FEW_SEEDS)
+
+
+def _against_ours(measure: Callable[[np.ndarray, np.ndarray], Interval], scores: Mapping[str, np.ndarray], name: str) -> str:
+    return _decimal(measure(scores[OURS], scores[name]), min(len(scores[OURS]), len(scores[name])))
 
 
 def _seconds(value: float) -> str:

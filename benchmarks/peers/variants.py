@@ -54,7 +54,7 @@ _STD_1 = {"policy_kwargs": "dict(log_std_init=0)"}
 CANDIDATES = {
     f"try-{name}": Variant(title, _BEFORE_TUNING | overrides)
     for name, title, overrides in (
-        ("first", "as before tuning: KL 0.01, five value steps at ε = 0.2, std e⁻¹, 8 × 256 steps", {}),
+        ("first", "starting point: KL 0.01, five value steps at ε = 0.2, std e⁻¹, 8 × 256 steps", {}),
         ("gymnasium", "… stepped by gymnasium, not by EnvPool", {"batched_envs": False}),
         ("envs-32", "… 32 environments × 64 steps", {"n_envs": 32, "n_steps": 64}),
         ("two-envs", "… 2 environments × 1 024 steps", {"n_envs": 2, "n_steps": 1024}),

@@ -1,4 +1,4 @@
-"""The paper's cart-pole (section 6.2.1), with the physical parameters of Barto, Sutton and Anderson (1983)."""
+"""The paper's cart-pole (section 6.2.2), with the physical parameters of Barto, Sutton and Anderson (1983)."""
 
 import math
 from pathlib import Path
