@@ -37,6 +37,12 @@ from sb3_gae import TRPOGAE, NumericalError, ResumableCheckpointCallback
 from sb3_gae.saving.checkpoint_file import checkpoints_in, is_whole
 
 ITERATIONS, N_STEPS, N_ENVS = 8, 32, 2
+#: of the words of the tally, on its page
+MEANING = """\
+**Survived** means that the training, continued from what was on the disk, ended with the same bits as one to which nothing
+was done: parameters, statistics, random generators. For numbers that are not finite and for errors of an environment it also means that the right
+exception was raised, with the parameters of the last good update. CartPole-v1, two environments, eight iterations.
+"""
 TOTAL = ITERATIONS * N_STEPS * N_ENVS
 # Seconds after which a process that should have ended is a loss
 PATIENCE = 120.0
@@ -371,7 +377,8 @@ def main(arguments: list[str]) -> int:
         print(line, file=out)
     if chosen.write:
         command = f"python benchmarks/fault_injection.py --kills {chosen.kills} --others {chosen.others} --seed {chosen.seed}"
-        chosen.write.write_text(f"# Tally of faults\n\nBy `{command}`; see [Checkpoints](checkpoints.md).\n\n{out.getvalue()}")
+        head = f"# Tally of faults\n\nBy `{command}`; see [Checkpoints](checkpoints.md).\n\n{MEANING}\n"
+        chosen.write.write_text(head + out.getvalue())
     return 1 if n_lost else 0
 
 
