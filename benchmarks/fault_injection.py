@@ -40,8 +40,9 @@ ITERATIONS, N_STEPS, N_ENVS = 8, 32, 2
 #: of the words of the tally, on its page
 MEANING = """\
 **Survived** means that the training, continued from what was on the disk, ended with the same bits as one to which nothing
-was done: parameters, statistics, random generators. For numbers that are not finite and for errors of an environment it also means that the right
-exception was raised, with the parameters of the last good update. CartPole-v1, two environments, eight iterations.
+was done: parameters, statistics, random generators. For numbers that are not finite and for errors of an environment it
+also means that the right exception was raised, with the parameters of the last good update. CartPole-v1, two
+environments, eight iterations.
 """
 TOTAL = ITERATIONS * N_STEPS * N_ENVS
 # Seconds after which a process that should have ended is a loss
