@@ -20,7 +20,7 @@ from benchmarks.peers.evaluation import Evaluator
 from benchmarks.peers.journal import BusyError, Journal, Record, State, journal_path, read_record
 from benchmarks.peers.plan import PRESETS, Cell
 from benchmarks.peers.pool import Options, Pool, check_libraries, cores_for
-from benchmarks.peers.progress import left_of, standings, summary
+from benchmarks.peers.progress import Bar, left_of, standings, summary
 from benchmarks.peers.recorder import Recorder
 from benchmarks.peers.settings import hash_of, settings_of
 from benchmarks.peers.table import read_results
@@ -135,6 +135,23 @@ def test_what_is_left_to_run(tmp_path: Path) -> None:
     assert "5 runs: 1 new, 1 unfinished, 1 done, 1 failed, 1 stale" in text
     assert f"failed: {cells[2].name}: a reason" in text
     assert "2 runs left, about 2.2 core-hours, 1.1 hours with 2 side by side" in text
+
+
+def test_the_bar_counts_what_has_ended_before_only_when_it_is_run_again(tmp_path: Path) -> None:
+    path = journal_path(tmp_path, CELL)
+    journal = Journal(path)
+    journal.begin(START)
+    journal.evaluated({"steps": CELL.steps})
+    journal.end(State.FAILED, "why")
+    bar = Bar([CELL], tmp_path)
+    assert bar._count() == (0, 0)
+    journal.begin(START)
+    journal.evaluated({"steps": 10})
+    assert bar._count() == (10, 0)
+    journal.end(State.DONE)
+    assert bar._count() == (CELL.steps, 1)
+    journal.close()
+    bar.close()
 
 
 def test_a_run_that_is_killed_is_recorded_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

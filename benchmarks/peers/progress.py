@@ -97,6 +97,8 @@ class Bar:
 
     def __init__(self, cells: Sequence[Cell], logs: Path):
         self._cells, self._logs = cells, logs
+        # What has ended and is among the cells is run again: until then its file says nothing of this run
+        self._old = {cell: record for cell in cells if (record := self._read(cell)).end is not None}
         total = sum(cell.steps for cell in cells)
         self._shown = time.monotonic()
         steps, _ = self._count()
@@ -116,10 +118,13 @@ class Bar:
         self._bar.close()
 
     def _count(self) -> tuple[int, int]:
-        records = [read_record(journal_path(self._logs, cell)) for cell in self._cells]
+        found = ((cell, self._read(cell)) for cell in self._cells)
+        records = {cell: record for cell, record in found if record != self._old.get(cell)}
+        # What failed is not run any further
         steps = sum(
-            # What failed is not run any further
-            cell.steps if record.end is not None else min(record.steps, cell.steps)
-            for cell, record in zip(self._cells, records, strict=True)
+            cell.steps if record.end is not None else min(record.steps, cell.steps) for cell, record in records.items()
         )
-        return steps, sum(record.end is not None for record in records)
+        return steps, sum(record.end is not None for record in records.values())
+
+    def _read(self, cell: Cell) -> Record:
+        return read_record(journal_path(self._logs, cell))
