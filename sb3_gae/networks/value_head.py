@@ -67,13 +67,14 @@ class ValueHead(nn.Linear):
         """
         Move the factor towards the root mean square of new targets and keep all values as they are.
 
-        :param value_targets: any shape
+        :param value_targets: any shape; so small beside the values that the weights would leave the range, they change nothing
         """
         self.n_batches += 1
         weight = max(self.momentum, 1.0 / int(self.n_batches))
         new_scale = th.hypot(self.scale * (1.0 - weight) ** 0.5, _root_mean_square(value_targets) * weight**0.5)
-        if _can_divide_by(new_scale):
-            ratio = self.scale / new_scale
+        ratio = self.scale / new_scale
+        # Products need powers of the weights: a scale that is far off is left until the values have come nearer
+        if _can_divide_by(new_scale) and ratio * self.weight.abs().max() < th.finfo(ratio.dtype).max ** 0.25:
             self.weight.mul_(ratio)
             if self.bias is not None:
                 self.bias.mul_(ratio)

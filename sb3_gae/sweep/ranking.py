@@ -35,7 +35,7 @@ class Rank(NamedTuple):
 
 def rank_curves(table: pd.DataFrame, iteration: int | None = None, by: str = "training") -> list[Rank]:
     """
-    :param table: selected by :func:`~sb3_gae.sweep.results.select`
+    :param table: what a :class:`~sb3_gae.sweep.selection.Selection` kept
     :param iteration: from 1; None for the last. Later ones do not count
     :param by: ``training`` or ``last``, see :class:`Rank`
     :return: the best one first

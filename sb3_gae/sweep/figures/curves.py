@@ -20,7 +20,7 @@ def curves_figure(table: pd.DataFrame) -> Figure:
 
     Where episodes end in fewer than half of all iterations, as those of environments in step do, dots say in which.
 
-    :param table: selected by :func:`~sb3_gae.sweep.results.select`
+    :param table: what a :class:`~sb3_gae.sweep.selection.Selection` kept
     :return: the figure
     :raises SweepError: if there is no iteration by which an episode had ended in every run
     """

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
-from matplotlib import rc_context
+from matplotlib import rc_context, rcdefaults, rcParams
 from matplotlib.figure import Figure
 
 from sb3_gae.sweep.errors import SweepError
@@ -21,7 +21,7 @@ SUFFIXES = (".png", ".svg")
 def write_figure(kind: str, table: pd.DataFrame, output: Path, iteration: int | None, by: str) -> list[Path]:
     """
     :param kind: a key of :data:`FIGURES`
-    :param table: selected by :func:`~sb3_gae.sweep.results.select`
+    :param table: what a :class:`~sb3_gae.sweep.selection.Selection` kept
     :param output: as :func:`~sb3_gae.sweep.figures.draw`
     :param iteration: as there
     :param by: as there
@@ -31,7 +31,10 @@ def write_figure(kind: str, table: pd.DataFrame, output: Path, iteration: int | 
     if output.suffix not in SUFFIXES and re.fullmatch(r"\.[A-Za-z]{2,}", output.suffix):
         raise SweepError(f"`output` must end in {' or '.join(SUFFIXES)}, or have no ending for both, got {output.name!r}.")
     paths = [output] if output.suffix in SUFFIXES else [output.with_name(output.name + suffix) for suffix in SUFFIXES]
-    with rc_context(STYLE):
+    with rc_context():
+        # Whatever the process that draws it has set: the same results, the same file
+        rcdefaults()
+        rcParams.update(STYLE)
         figure = FIGURES[kind](table) if kind == "curves" else FIGURES[kind](table, iteration, by)
         try:
             output.parent.mkdir(parents=True, exist_ok=True)

@@ -19,7 +19,7 @@ def heatmap_figure(table: pd.DataFrame, iteration: int | None = None, by: str = 
     """
     Interquartile mean over seeds; each cell has its number of seeds, the best one a frame.
 
-    :param table: selected by :func:`~sb3_gae.sweep.results.select`
+    :param table: what a :class:`~sb3_gae.sweep.selection.Selection` kept
     :param iteration: from 1; None for the last
     :param by: one of :data:`~sb3_gae.sweep.series.SCORES`
     :return: the figure

@@ -19,7 +19,7 @@ def lambda_figure(table: pd.DataFrame, iteration: int | None = None, by: str = "
     """
     What each λ loses against the best one, a U between bias and variance; the right-hand axis has the return itself.
 
-    :param table: selected by :func:`~sb3_gae.sweep.results.select`
+    :param table: what a :class:`~sb3_gae.sweep.selection.Selection` kept
     :param iteration: from 1; None for the last
     :param by: one of :data:`~sb3_gae.sweep.series.SCORES`
     :return: the figure
