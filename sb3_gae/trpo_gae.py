@@ -1,42 +1,19 @@
 """Trust-region policy optimization with generalized advantage estimation."""
 
-import io
-import pathlib
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, ClassVar, Self, cast
 
-import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.buffers import RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_gae.batch import TrainingBatch, random_subset, standardized
-from sb3_gae.checks import check_finite_parameters, check_finite_rollout, check_finite_step, check_number
 from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
-from sb3_gae.lambda_rules import LambdaRule, lambda_rule
+from sb3_gae.lambda_rules import LambdaRule
 from sb3_gae.networks.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
-from sb3_gae.networks.value_head import ValueHead
-from sb3_gae.rollout.collection import (
-    CollectsRollouts,
-    Observations,
-    RolloutEnd,
-    RolloutPlan,
-    Step,
-    TerminalObservation,
-    take_steps,
-    terminal_observations,
-)
-from sb3_gae.rollout.episode_quota import EpisodeQuota
-from sb3_gae.rollout.evaluation import evaluate_rollout, reward_returns, training_batch
-from sb3_gae.rollout.rollout_buffer import GAEDictRolloutBuffer, GAERolloutBuffer
-from sb3_gae.rollout.threads import threads_for_steps
-from sb3_gae.rollout.time_baseline import TimeBaseline
+from sb3_gae.on_policy_algorithm import GAEOnPolicyAlgorithm
+from sb3_gae.rollout.evaluation import training_batch
 from sb3_gae.saving.portable_model import PortableModel
 from sb3_gae.saving.resumable import ResumableModel
 from sb3_gae.update.adam_fit import adam_fit
@@ -49,7 +26,7 @@ from sb3_gae.update.value_step import ValueFitRecord, value_parameters, value_st
 from sb3_gae.workers.ray_vec_env import env_on_workers
 
 
-class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
+class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
     r"""
     Trust-region policy optimization with generalized advantage estimation and a trust-region value function.
 
@@ -131,7 +108,6 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         "MultiInputPolicy": MultiInputPolicy,
         "SharedMlpPolicy": SharedMlpPolicy,
     }
-    rollout_buffer: GAERolloutBuffer
 
     def __init__(
         self,
@@ -189,10 +165,11 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
             learning_rate=1e-3 if learning_rate is None else learning_rate,
             n_steps=n_steps,
             gamma=gamma,
-            gae_lambda=gae_lambda,  # type: ignore[arg-type]
-            ent_coef=0.0,
-            vf_coef=0.0,
-            max_grad_norm=0.0,
+            gae_lambda=gae_lambda,
+            value_lambda=value_lambda,
+            normalize_value=normalize_value,
+            n_episodes=n_episodes,
+            baseline=baseline,
             use_sde=use_sde,
             sde_sample_freq=sde_sample_freq,
             rollout_buffer_class=rollout_buffer_class,
@@ -203,8 +180,6 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
             verbose=verbose,
             seed=seed,
             device=device,
-            _init_setup_model=False,
-            supported_action_spaces=(spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary),
         )
         self.batch_size = 128 if batch_size is None else batch_size
         self.n_critic_updates = 10 if n_critic_updates is None else n_critic_updates
@@ -215,7 +190,6 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         self.normalize_advantage = normalize_advantage
         self.target_kl = target_kl
         self.sub_sampling_factor = sub_sampling_factor
-        self.value_lambda = value_lambda
         self.vf_trust_region = vf_trust_region
         self.vf_steps = vf_steps
         self.vf_cg_max_steps = vf_cg_max_steps
@@ -223,164 +197,22 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         self.vf_kl_fraction = vf_kl_fraction
         self.cg_tolerance = cg_tolerance
         self.vf_optimizer = vf_optimizer
-        self.normalize_value = normalize_value
         self.curvature_samples = curvature_samples
-        self.n_episodes = n_episodes
-        self.baseline = baseline
         self.value_fit_first = value_fit_first
-        self._numerical_failures = 0
-        self._time_baseline = TimeBaseline()
-        self._lambda_rule: LambdaRule | None = None
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
-        if (rule := lambda_rule(self.gae_lambda)) is not None:
-            self._lambda_rule, self.gae_lambda = rule, rule.value(1.0)
-        check_hyperparameters(vars(self))
-        if self.rollout_buffer_class is None:
-            is_dict = isinstance(self.observation_space, spaces.Dict)
-            self.rollout_buffer_class = GAEDictRolloutBuffer if is_dict else GAERolloutBuffer
         super()._setup_model()
         if not any(parameter.requires_grad for parameter in self.policy.parameters()):
             raise ValueError("The policy has no trainable parameters; give it layers, or unfreeze them.")
 
+    def _check_arguments(self) -> None:
+        check_hyperparameters(vars(self))
+
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
         # SB3's own default is the name of its class, which no policy of ours has
         super()._maybe_recommend_cpu(mlp_class_name)
-
-    def collect_rollouts(  # type: ignore[override]
-        self, env: VecEnv, callback: BaseCallback, rollout_buffer: GAERolloutBuffer, n_rollout_steps: int
-    ) -> bool:
-        """
-        Fill the buffer with steps of the current policy, and compute their values and advantages.
-
-        :param env: the training environments
-        :param callback: called at each step, and at the beginning and the end
-        :param rollout_buffer: to be filled
-        :param n_rollout_steps: steps of each environment
-        :return: False if the callback ended training before the buffer was full
-        :raises NumericalError: if a parameter of the policy, an observation, action, reward or value is not finite
-        :raises ValueError: if a schedule or rule of ``gae_lambda`` leaves [0, 1]
-        :raises WorkersLostError: if the environments are on workers that are gone and cannot be replaced
-        """
-        assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
-        # First, so that a callback finds everything as the last iteration left it
-        callback.on_rollout_start()
-        quota = EpisodeQuota(env.num_envs, self.n_episodes)
-        if self.n_episodes is not None and not self._last_episode_starts.all():
-            self._last_obs, self._last_episode_starts = cast(Observations, env.reset()), np.ones(env.num_envs, dtype=bool)
-        check_finite_parameters(self.policy)
-        check_finite_step("observation", self._last_obs, 0)
-        self.policy.set_training_mode(False)
-        rollout_buffer.reset()
-        with threads_for_steps(self.policy, env.num_envs):
-            terminal = self._collect_steps(env, callback, rollout_buffer, n_rollout_steps, quota)
-        if terminal is None:
-            return False
-
-        if self.n_episodes is not None:
-            self._finish_episodes(rollout_buffer, quota)
-        self._rollout_end = RolloutEnd(terminal, self._last_obs, self._last_episode_starts)
-        if self._lambda_rule is not None:
-            self.gae_lambda = self._lambda_rule.value(self._current_progress_remaining)
-            check_number("gae_lambda", self.gae_lambda, 0.0, 1.0)
-        self._estimate_advantages(rollout_buffer)
-        if self._lambda_rule is not None:
-            self._learn_lambda(self._lambda_rule, rollout_buffer)
-        callback.update_locals(locals())
-        callback.on_rollout_end()
-        return True
-
-    def _collect_steps(
-        self,
-        env: VecEnv,
-        callback: BaseCallback,
-        rollout_buffer: GAERolloutBuffer,
-        n_rollout_steps: int,
-        quota: EpisodeQuota,
-    ) -> list[TerminalObservation] | None:
-        """Take the steps of a rollout, and return where time limits struck; nothing if the callback ended training."""
-        terminal: list[TerminalObservation] = []
-        for n_steps, step in enumerate(self._steps(env, n_rollout_steps, quota)):
-            actions, clipped_actions, new_obs = step.actions, step.clipped_actions, step.new_observations
-            rewards, dones, infos = step.rewards, step.dones, step.infos
-            self.num_timesteps += step.n_taken
-            callback.update_locals(locals())
-            if not callback.on_step():
-                return None
-
-            counts = quota.counts
-            truncated = np.zeros(env.num_envs, dtype=bool)
-            if dones.any():
-                endings = self._record_endings(n_steps, dones, dones if counts is None else dones & counts, infos)
-                terminal.extend(endings)
-                truncated[[ending.env for ending in endings]] = True
-            rollout_buffer.add_step(step.observations, actions, rewards, step.episode_starts, dones, truncated, counts)
-            quota.add(dones)
-            self._last_obs = new_obs
-            self._last_episode_starts = dones
-        # For the end of the rollout, when the number of steps is one more
-        n_steps = rollout_buffer.pos
-        callback.update_locals(locals())
-        return terminal
-
-    def _steps(self, env: VecEnv, n_rollout_steps: int, quota: EpisodeQuota) -> Iterator[Step]:
-        """Taken here, or collected by environments that do so themselves."""
-        assert self._last_obs is not None and self._last_episode_starts is not None
-        plan = RolloutPlan(n_rollout_steps, self.n_episodes, self.use_sde, self.sde_sample_freq)
-        if isinstance(base := env.unwrapped, CollectsRollouts):
-            return base.collect_rollout(self.policy, env, plan)
-        return take_steps(self.policy, env, self._last_obs, self._last_episode_starts, plan, quota)
-
-    def _record_endings(
-        self, step: int, dones: np.ndarray, counted: np.ndarray, infos: list[dict[str, Any]]
-    ) -> list[TerminalObservation]:
-        """Log the episodes of the batch that ended in a step, and return those that a time limit ended."""
-        ended = [infos[env] for env in np.flatnonzero(counted)]
-        self._update_info_buffer(ended, np.ones(len(ended), dtype=bool))
-        self._numerical_failures += sum(bool(infos[env].get("numerical_failure")) for env in np.flatnonzero(dones))
-        if self._numerical_failures:
-            self.logger.record("rollout/numerical_failures", self._numerical_failures)
-        return terminal_observations(step, counted, infos)
-
-    def _learn_lambda(self, rule: LambdaRule, rollout_buffer: GAERolloutBuffer) -> None:
-        self.logger.record("gae_lambda/value", self.gae_lambda)
-        for name, value in rule.learn_from(self.policy, rollout_buffer).items():
-            self.logger.record(f"gae_lambda/{name}", value)
-
-    def _finish_episodes(self, rollout_buffer: GAERolloutBuffer, quota: EpisodeQuota) -> None:
-        rollout_buffer.finish()
-        if not quota.is_met:
-            warnings.warn(
-                f"`n_steps` = {self.n_steps} ended before every environment had finished `n_episodes` = {self.n_episodes}; "
-                "the last episodes are cut there and their rest is estimated. Raise `n_steps`.",
-                stacklevel=2,
-            )
-
-    def _estimate_advantages(self, rollout_buffer: GAERolloutBuffer) -> None:
-        """Values, advantages and targets of a full buffer, all with the value function as it is now."""
-        rollout_buffer.gamma, rollout_buffer.gae_lambda = self.gamma, self.gae_lambda
-        rollout_buffer.value_lambda = self.value_lambda
-        if self.value_lambda is None and self._lambda_rule is not None:
-            rollout_buffer.value_lambda = self._lambda_rule.target_lambda
-        if (head := self._value_head()) is not None and head.is_as_constructed:
-            head.initialize_scale(rollout_buffer.to_torch(reward_returns(rollout_buffer)))
-        last_values = evaluate_rollout(self.policy, rollout_buffer, self._rollout_end)
-        if self.baseline == "time":
-            # The return less its mean: neither lambda has a part in it
-            rollout_buffer.gae_lambda, rollout_buffer.value_lambda = 1.0, None
-            last_values = th.as_tensor(self._time_baseline.fill(rollout_buffer, self._rollout_end.dones, self.gamma))
-        rollout_buffer.compute_returns_and_advantage(last_values, self._rollout_end.dones)
-        check_finite_rollout("advantage", rollout_buffer.advantages)
-        check_finite_rollout("value target", rollout_buffer.returns)
-
-    def _value_head(self) -> ValueHead | None:
-        """The layer whose scale follows the returns, if it is to and is not frozen."""
-        head = getattr(self.policy, "value_net", None)
-        if not self.normalize_value or self.baseline != "value" or not isinstance(head, ValueHead):
-            return None
-        return head if all(parameter.requires_grad for parameter in head.parameters()) else None
 
     def train(self) -> None:
         """
@@ -493,13 +325,3 @@ class TRPOGAE(ResumableModel, PortableModel, OnPolicyAlgorithm):
         :raises WorkersLostError: if workers are gone and cannot be replaced; the message says how to go on
         """
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_rollout_end"]
-
-    @classmethod
-    def load(cls, path: str | pathlib.Path | io.BufferedIOBase, env: GymEnv | None = None, *args: Any, **kwargs: Any) -> Self:
-        if "gae_lambda" in kwargs or "gae_lambda" in (kwargs.get("custom_objects") or {}):
-            # A rule that was saved would overrule it
-            kwargs["_lambda_rule"] = None
-        return super().load(path, env, *args, **kwargs)
