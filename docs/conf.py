@@ -24,8 +24,9 @@ extensions = [
 exclude_patterns = ["_build"]
 source_suffix = {".md": "markdown"}
 nitpicky = True
-# Names that autodoc finds behind NumPy's ArrayLike, and classes whose projects are not linked to
+# Names within SB3's aliases and NumPy's ArrayLike, and classes whose projects are not linked to
 nitpick_ignore = [
+    ("py:class", "BaseCallback"),
     ("py:class", "VecEnv"),
     ("py:class", "collections.abc.Mapping[str"),
     ("py:class", "collections.abc.Callable[[]"),

@@ -22,15 +22,13 @@ Edges = Mapping[str, set[str]]
 #: a room and nothing, or where the arrow from one to another passes a floor
 Node = tuple[str, ...]
 
-WIDTH, ROW, HEIGHT, MARGIN, PASSAGE = 132, 84, 34, 14, 20
+WIDTH, ROW, HEIGHT, MARGIN, PASSAGE = 146, 84, 34, 14, 20
 SWEEPS = 8
+# Boxes bring their own light ground and arrows are grey: so it reads on white and on dark
 STYLE = """
-  .room { fill: #fff; stroke: #555; } .file { fill: #f3f3f0; stroke: #999; } text { fill: #222; }
+  .room { fill: #d9e8f5; stroke: #4a7ba6; } .file { fill: #f6f4ee; stroke: #999; } text { fill: #222; }
   .arrow { fill: none; stroke: #8a8a8a; } .head { fill: #8a8a8a; }
-  text { font: 13px sans-serif; text-anchor: middle; }
-  @media (prefers-color-scheme: dark) {
-    .room { fill: #2b2b2b; stroke: #bbb; } .file { fill: #222; stroke: #888; } text { fill: #eee; }
-  }"""
+  text { font: 13px sans-serif; text-anchor: middle; }"""
 
 
 def room_of(file: Path) -> str:
