@@ -27,7 +27,7 @@ TASKS = {
     "Hopper-v5": (["lambda-rules-Hopper-v5", "lambda-auto-Hopper-v5"], ["lambda-auto-Hopper-v5"]),
 }
 LAMBDAS = (0.84, 0.92, 0.96)
-AUTO, FIXED = "least_squared_error_lambda", "trust_region"
+AUTO, FIXED = "auto_lambda", "trust_region"
 RESAMPLES = 4_000
 
 

@@ -46,7 +46,7 @@ def test_from_a_dry_run_to_figures(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_results_of_several_sweeps_go_into_one_table(capsys: pytest.CaptureFixture[str]) -> None:
-    for name, condition in (("fixed", "trust_region"), ("auto", "measured_lambda")):
+    for name, condition in (("fixed", "trust_region"), ("auto", "improvement_lambda")):
         assert main([*RUN, "--gammas", ".9", "--seeds", "1", "--name", name, "--conditions", condition, *TINY]) == 0
         assert main(["export", "--name", name, "-o", f"{name}.csv"]) == 0
     capsys.readouterr()

@@ -86,6 +86,6 @@ def test_figures_are_the_same_bit_for_bit(kind: str, sweep_table: pd.DataFrame, 
 
 def test_conditions_without_lambda_are_told_apart(sweep_table: pd.DataFrame) -> None:
     chosen = sweep_table[(sweep_table["condition"] == "no_vf") | (sweep_table["gae_lambda"] == 0.5)]
-    both = pd.concat([chosen, chosen[chosen["condition"] == "no_vf"].assign(condition="measured_lambda")])
+    both = pd.concat([chosen, chosen[chosen["condition"] == "no_vf"].assign(condition="improvement_lambda")])
     lines = curves_figure(both).axes[0].lines
     assert len({(str(line.get_color()), str(line.get_linestyle()), line._unscaled_dash_pattern) for line in lines}) == 4  # type: ignore[attr-defined]

@@ -48,8 +48,8 @@ def test_seeds_are_outermost_and_overrides_have_no_order() -> None:
     [
         ("trust_region", {}),
         ("no_vf", {"baseline": "time"}),
-        ("measured_lambda", {"gae_lambda": "improvement"}),
-        ("least_squared_error_lambda", {"gae_lambda": "auto"}),
+        ("improvement_lambda", {"gae_lambda": "improvement"}),
+        ("auto_lambda", {"gae_lambda": "auto"}),
         ("explained_variance_lambda", {"gae_lambda": "explained_variance"}),
         ("value_first", {"value_fit_first": True}),
         ("adam", {"vf_optimizer": "adam"}),

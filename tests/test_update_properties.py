@@ -140,10 +140,10 @@ def test_every_step_keeps_to_its_constraint_and_all_stays_finite(
 ) -> None:
     """Or the update says that a number is out of range, and has moved nothing."""
     model = make_model(env, arguments, n_envs)
-    # Squares of such numbers are out of the range of single precision. Observations are never normalized here
+    # Conjugate gradient has fourth powers of them, and single precision ends at 1e38. Observations are never normalized here
     normalized = arguments["normalize_value"] and arguments["normalize_advantage"]
     largest = env["reward_scale"] * max(1.0, env["observation_scale"])  # derivatives of values by the first layer
-    extreme = env["observation_scale"] < 1e-15 or not (normalized or (env["reward_scale"] >= 1e-15 and largest <= 1e12))
+    extreme = env["observation_scale"] < 1e-9 or not (normalized or (env["reward_scale"] > 1e-9 and largest < 1e9))
     with watched(model) as watch:
         for _ in range(2):
             before = state_of(model.policy)

@@ -25,8 +25,8 @@ class Condition:
 CONDITIONS: dict[str, Condition] = {
     "trust_region": Condition("value function by trust region"),
     "no_vf": Condition("no value function", {"baseline": "time"}, uses_lambda=False),
-    "measured_lambda": Condition("λ by the measured improvement", {"gae_lambda": "improvement"}, uses_lambda=False),
-    "least_squared_error_lambda": Condition("λ by the measured squared error", {"gae_lambda": "auto"}, uses_lambda=False),
+    "improvement_lambda": Condition("λ by the measured improvement", {"gae_lambda": "improvement"}, uses_lambda=False),
+    "auto_lambda": Condition("λ by the measured squared error", {"gae_lambda": "auto"}, uses_lambda=False),
     "explained_variance_lambda": Condition(
         "λ by the explained variance", {"gae_lambda": "explained_variance"}, uses_lambda=False
     ),
