@@ -15,6 +15,7 @@ version = release = sb3_gae.__version__
 
 extensions = [
     "myst_parser",
+    "listed_members",
     "mathml",
     "sphinx.ext.autodoc",
     "sphinx.ext.doctest",
@@ -46,7 +47,8 @@ from sb3_gae.estimators.measures import *
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
-autodoc_default_options = {"members": True, "show-inheritance": True}
+# No default for members: it would take the place of each list of them
+autodoc_default_options = {"show-inheritance": True}
 
 # Inventories of what is linked to lie here: a build reaches nothing outside the machine
 intersphinx_mapping = {

@@ -38,7 +38,7 @@ from sb3_gae.rollout.time_baseline import TimeBaseline
 class GAEOnPolicyAlgorithm(OnPolicyAlgorithm):
     r"""
     Collects batches, and estimates their values, advantages and value targets. A subclass learns from them in ``train``,
-    and says in ``_check_arguments`` what it refuses.
+    says in ``_check_arguments`` what it refuses, and calls ``_setup_model`` at the end of its constructor.
 
     :param policy: a class, or a name of ``policy_aliases``
     :param env: the environment to learn from (if registered in Gym, can be str)
@@ -48,8 +48,8 @@ class GAEOnPolicyAlgorithm(OnPolicyAlgorithm):
     :param normalize_value: whether the value network's outputs are in units of a running scale of the returns
     :param n_episodes: whole episodes of each environment in a batch; None for batches of ``n_steps`` steps
     :param baseline: ``"value"``, or ``"time"`` for the mean return at each timestep
-    :param arguments: of SB3's ``OnPolicyAlgorithm``
-    :raises ValueError: if ``gae_lambda`` is neither a number nor a rule
+    :param arguments: others of SB3's ``OnPolicyAlgorithm``, but for those of its loss, ``supported_action_spaces`` and
+        ``_init_setup_model``
     """
 
     rollout_buffer: GAERolloutBuffer

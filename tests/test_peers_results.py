@@ -245,5 +245,5 @@ def test_a_report_is_a_page_and_figures(tmp_path: Path, monkeypatch: pytest.Monk
     readme.write_text(report.README.read_text())
     written = report.write_report(page, tmp_path, readme)
     assert "![Return against steps on each task](images/peers_steps.svg)" in page.read_text()
-    assert {path.name for path in written} >= {"page.md", "README.md", "peers_steps.svg", "peers_steps.png"}
+    assert {path.name for path in written} >= {"page.md", "README.md", "peers_steps.svg"}
     assert all(path.stat().st_size > 0 for path in written)

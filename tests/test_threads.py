@@ -83,11 +83,13 @@ def test_a_gaussian_mlp_draws_the_policy_s_actions(observation_space: spaces.Box
     sample = ActionSampler(policy)
     assert sample._layers
     observations = np.random.default_rng(0).normal(size=(5, 3)).astype(observation_space.dtype)
+    before = observations.copy()
     th.manual_seed(0)
     found = sample(observations, 0)
     th.manual_seed(0)
     expected = policy._predict(th.as_tensor(observations)).detach().numpy()
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(observations, before)
 
 
 @pytest.mark.parametrize("kwargs", [{"use_sde": True}, {"policy_kwargs": {"net_arch": [8], "squash_output": False}}])

@@ -132,7 +132,7 @@ def make_model(env: dict[str, Any], arguments: dict[str, Any], n_envs: int) -> T
 
 
 @pytest.mark.filterwarnings("ignore:overflow|invalid value|divide by zero")
-@settings(max_examples=80, derandomize=True)
+@settings(max_examples=80)
 @example(TINY[0], TINY[1], 1)
 @given(environments, arguments, st.integers(1, 3))
 def test_every_step_keeps_to_its_constraint_and_all_stays_finite(

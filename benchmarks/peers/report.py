@@ -70,7 +70,7 @@ def write_report(page: Path = PAGE, images: Path = IMAGES, readme: Path = README
     from matplotlib import rc_context
 
     from benchmarks.peers.figures import draw_all
-    from sb3_gae.sweep.figures.files import SUFFIXES, save_figure
+    from sb3_gae.sweep.figures.files import save_figure
     from sb3_gae.sweep.figures.style import STYLE
 
     sections = sections_of(table)
@@ -80,7 +80,6 @@ def write_report(page: Path = PAGE, images: Path = IMAGES, readme: Path = README
     images.mkdir(parents=True, exist_ok=True)
     with rc_context(STYLE):
         for name, figure in draw_all(table).items():
-            for suffix in SUFFIXES:
-                save_figure(figure, images / f"{name}{suffix}")
-                written.append(images / f"{name}{suffix}")
+            save_figure(figure, images / f"{name}.svg")
+            written.append(images / f"{name}.svg")
     return written

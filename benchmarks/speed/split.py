@@ -11,7 +11,7 @@ from benchmarks.rollout_speed import Learner, make_learner, physics_of
 from benchmarks.speed import results
 from benchmarks.speed.iteration_cases import BIPED, CHEETAH, CHEETAH_ENVS, tasks
 from benchmarks.speed.stopwatch import POLICY_STEP, ROLLOUT, UPDATE, VALUE_FIT, Section, Stopwatch
-from sb3_gae import TRPOGAE, trpo_gae
+from sb3_gae import TRPOGAE, on_policy_algorithm
 from sb3_gae.rollout.collection import ActionSampler
 from sb3_gae.update import trust_region
 from sb3_gae.update.kronecker import KroneckerPreconditioner
@@ -42,7 +42,7 @@ def watch(stopwatch: Stopwatch, learner: Learner) -> None:
     stopwatch.watch(Section(ROLLOUT, "resets"), base, "_restart_envs")
     stopwatch.watch(Section(ROLLOUT, "physics"), physics, *calls)
     stopwatch.watch(Section(ROLLOUT, "policy"), ActionSampler, "__call__")
-    stopwatch.watch(Section(ROLLOUT, "policy"), trpo_gae, "evaluate_rollout")
+    stopwatch.watch(Section(ROLLOUT, "policy"), on_policy_algorithm, "evaluate_rollout")
     stopwatch.watch(Section(ROLLOUT, "advantages"), model, "_estimate_advantages")
     stopwatch.watch(Section(UPDATE, "other"), model, "train")
     stopwatch.watch(Section(POLICY_STEP, "gradient"), model, "_step_policy")

@@ -12,6 +12,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
+from sb3_gae.networks.layers import activate, pair_up
 from sb3_gae.networks.parameters import unflatten
 
 _aten = th.ops.aten
@@ -29,9 +30,6 @@ _TIMES_DERIVATIVE: dict[type[nn.Module], Callable[[Any, th.Tensor, th.Tensor], t
 # Rows that go through all layers together: few enough to stay in the cache, enough to keep the cores busy
 _BLOCK_ROWS = 8192
 
-# Mean square of a layer's outputs below which a rounding of 1 in their tanh would be seen in what is made of them
-_LEAST_SQUARE = 2.0**-12
-
 
 class DenseNetwork:
     """
@@ -42,7 +40,7 @@ class DenseNetwork:
     """
 
     def __init__(self, layers: Sequence[nn.Module], inputs: th.Tensor):
-        self.layers = _pair_up(layers)
+        self.layers = pair_up(layers)
         self.blocks = inputs.split(_BLOCK_ROWS)
         self.batch_size = len(inputs)
         # For each block the input of each layer, and last the output of the network
@@ -56,7 +54,7 @@ class DenseNetwork:
             with no hooks, no frozen and no shared parameters
         """
         parameters = [parameter for layer in layers for parameter in layer.parameters()]
-        pairs = _pair_up(layers)
+        pairs = pair_up(layers)
         return (
             bool(pairs)
             and all(type(linear) is nn.Linear and (act is None or type(act) in _TIMES_DERIVATIVE) for linear, act in pairs)
@@ -89,7 +87,7 @@ class DenseNetwork:
         hidden = [inputs]
         for linear, activation in self.layers:
             outputs = linear(hidden[-1])
-            hidden.append(outputs if activation is None else _activate(activation, outputs))
+            hidden.append(outputs if activation is None else activate(activation, outputs))
         return hidden
 
     def _times_derivative(self, index: int, layer: int, tangents: th.Tensor) -> th.Tensor:
@@ -183,27 +181,3 @@ class DenseNetwork:
         pieces = (piece for _, piece in unflatten(self.parameters, vector))
         for linear, _ in self.layers:
             yield next(pieces), None if linear.bias is None else next(pieces)
-
-
-def _activate(activation: nn.Module, outputs: th.Tensor) -> th.Tensor:
-    """The activation of fresh ``outputs``, which may be overwritten."""
-    if type(activation) is not nn.Tanh or outputs.device.type != "cpu":
-        return activation(outputs)
-    flat = outputs.view(-1)
-    if flat.dot(flat) < _LEAST_SQUARE * len(flat):
-        return outputs.tanh_()
-    # tanh(x) = 2 sigmoid(2x) - 1 to a rounding of 1, in half the time of torch's kernel, the largest cost of a pass
-    return outputs.mul_(2.0).sigmoid_().mul_(2.0).sub_(1.0)
-
-
-def _pair_up(layers: Sequence[nn.Module]) -> list[tuple[nn.Linear, nn.Module | None]]:
-    """Each linear layer with the activation after it; empty where the layers do not alternate so."""
-    pairs: list[tuple[nn.Linear, nn.Module | None]] = []
-    for layer in layers:
-        if isinstance(layer, nn.Linear):
-            pairs.append((layer, None))
-        elif pairs and pairs[-1][1] is None:
-            pairs[-1] = (pairs[-1][0], layer)
-        else:
-            return []
-    return pairs

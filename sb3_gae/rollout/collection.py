@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_gae.checks import check_finite_step
 from sb3_gae.errors import NumericalError
 from sb3_gae.networks.dense_policy import gaussian_layers
+from sb3_gae.networks.layers import activate, pair_up
 from sb3_gae.rollout.episode_quota import EpisodeQuota
 
 Observations = np.ndarray | dict[str, np.ndarray]
@@ -102,8 +103,8 @@ class ActionSampler:
     """
     Draws the actions of the steps of one rollout.
 
-    A Gaussian MLP is asked for its layers, which draws the same actions as the policy itself without making and checking a
-    distribution in each step.
+    A Gaussian MLP is asked for its layers, which draws the same actions as the policy itself, to a rounding of their means,
+    without making and checking a distribution in each step.
 
     :param policy: in evaluation mode
     :param first_env: number of the first environment, for messages
@@ -113,7 +114,7 @@ class ActionSampler:
     def __init__(self, policy: ActorCriticPolicy, first_env: int = 0):
         self._policy = policy
         self._first_env = first_env
-        self._layers = gaussian_layers(policy)
+        self._layers = pair_up(gaussian_layers(policy))
         self._std = policy.log_std.detach().exp() if self._layers else None
         if self._std is not None and (self._std == 0.0).any():
             raise NumericalError("The policy's standard deviation is 0 in single precision; there is nothing left to explore.")
@@ -139,8 +140,10 @@ class ActionSampler:
         if self._std is None:
             return self._policy._predict(observations)
         mean = observations.float()
-        for layer in self._layers:
-            mean = layer(mean)
+        for linear, activation in self._layers:
+            mean = linear(mean)
+            if activation is not None:
+                mean = activate(activation, mean)
         return mean + th.normal(th.zeros_like(mean), th.ones_like(mean)) * self._std
 
 
