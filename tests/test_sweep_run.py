@@ -188,7 +188,9 @@ def test_a_failing_cell_is_recorded_and_the_others_go_on() -> None:
 def test_results_carry_where_they_come_from() -> None:
     table = run_sweep(seeds=1, **GRID, progress=False)
     assert table["iteration"].tolist() == [1, 2]
-    assert set(table["torch"]) == {th.__version__}
+    # Builds of torch differ in whether the package's version names the processor
+    (torch_version,) = set(table["torch"])
+    assert th.__version__.startswith(torch_version)
     assert json.loads(table["settings"][0]) | {"n_steps": 32, "gamma": 0.9, "batched_envs": True} == json.loads(
         table["settings"][0]
     )
