@@ -9,6 +9,7 @@ import torch as th
 from envs_for_tests import CHANNEL_FIRST, AnySpacesEnv, small_model, vec_env
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
+from torch import nn
 
 from sb3_gae.errors import NumericalError
 from sb3_gae.rollout.collection import ActionSampler
@@ -74,15 +75,28 @@ SMOOTH = spaces.Box(-np.inf, np.inf, (3,), np.float64)
 
 
 @pytest.mark.parametrize("observation_space", [spaces.Box(-1.0, 1.0, (3,), np.float32), SMOOTH])
-@pytest.mark.parametrize("net_arch", [[], [8], [8, 8]])
-def test_a_gaussian_mlp_draws_the_policy_s_actions(observation_space: spaces.Box, net_arch: list[int]) -> None:
-    model = small_model(vec_env(lambda: AnySpacesEnv(observation_space)), policy_kwargs={"net_arch": net_arch})
+@pytest.mark.parametrize(
+    ("net_arch", "activation", "n_rows"),
+    [
+        ([], nn.Tanh, 5),
+        ([8], nn.Tanh, 5),
+        ([8, 8], nn.Tanh, 5),
+        ([8, 8], nn.ReLU, 5),
+        ([8], nn.PReLU, 5),
+        ([64, 64], nn.Tanh, 65),
+    ],
+)
+def test_a_gaussian_mlp_draws_the_policy_s_actions(
+    observation_space: spaces.Box, net_arch: list[int], activation: type[nn.Module], n_rows: int
+) -> None:
+    architecture = {"net_arch": net_arch, "activation_fn": activation}
+    model = small_model(vec_env(lambda: AnySpacesEnv(observation_space)), policy_kwargs=architecture)
     policy = model.policy
     with th.no_grad():
         policy.log_std.copy_(th.tensor([-0.7, 0.3]))
     sample = ActionSampler(policy)
-    assert sample._layers
-    observations = np.random.default_rng(0).normal(size=(5, 3)).astype(observation_space.dtype)
+    assert sample._mean is not None
+    observations = np.random.default_rng(0).normal(size=(n_rows, 3)).astype(observation_space.dtype)
     before = observations.copy()
     th.manual_seed(0)
     found = sample(observations, 0)
@@ -90,6 +104,8 @@ def test_a_gaussian_mlp_draws_the_policy_s_actions(observation_space: spaces.Box
     expected = policy._predict(th.as_tensor(observations)).detach().numpy()
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6)
     np.testing.assert_array_equal(observations, before)
+    # So small are the products that NumPy makes; those of 65 rows with 64 x 64 weights are torch's
+    assert (sample._mean._most_rows >= n_rows) == (n_rows < 65)
 
 
 @pytest.mark.parametrize("kwargs", [{"use_sde": True}, {"policy_kwargs": {"net_arch": [8], "squash_output": False}}])
@@ -97,7 +113,7 @@ def test_others_are_asked_themselves(kwargs: dict[str, Any]) -> None:
     policy = small_model(vec_env(), **kwargs).policy
     if not kwargs.get("use_sde"):
         policy.action_net.register_forward_hook(lambda module, inputs, output: output + 1.0)
-    assert not ActionSampler(policy)._layers
+    assert ActionSampler(policy)._mean is None
 
 
 def test_parameters_that_are_no_numbers_are_found() -> None:

@@ -49,6 +49,7 @@ _BEFORE_TUNING = {
 _STD_SMALLER = {"policy_kwargs": "dict(log_std_init=-2)"}
 _MANY_JOINTS = _STD_SMALLER | {"target_kl": 0.03, "gae_lambda": 0.9}
 _STD_1 = {"policy_kwargs": "dict(log_std_init=0)"}
+_STD_1_TWO_ENVS = _STD_1 | {"n_envs": 2, "n_steps": 1024}
 
 #: settings that were tried on the seeds for tuning
 CANDIDATES = {
@@ -115,11 +116,22 @@ CANDIDATES = {
         ("std-1-adam", "initial std 1, value function fitted by Adam", _STD_1 | _ADAM),
         ("std-1-adam-kl-.05", "initial std 1, value function fitted by Adam, KL 0.05", _STD_1 | _ADAM | {"target_kl": 0.05}),
         ("std-1-envs-32", "initial std 1, 32 environments × 64 steps", _STD_1 | {"n_envs": 32, "n_steps": 64}),
-        ("std-1-two-envs", "initial std 1, 2 × 1 024 steps", _STD_1 | {"n_envs": 2, "n_steps": 1024}),
+        ("std-1-two-envs", "initial std 1, 2 × 1 024 steps", _STD_1_TWO_ENVS),
+        ("std-1-two-envs-kl-.03", "initial std 1, 2 × 1 024 steps, KL 0.03", _STD_1_TWO_ENVS | {"target_kl": 0.03}),
+        (
+            "std-1-two-envs-kl-.03-lambda-.98",
+            "initial std 1, 2 × 1 024 steps, KL 0.03, λ 0.98",
+            _STD_1_TWO_ENVS | {"target_kl": 0.03, "gae_lambda": 0.98},
+        ),
+        (
+            "two-envs-kl-.03",
+            "… 2 × 1 024 steps, KL 0.03",
+            {"n_envs": 2, "n_steps": 1024, "target_kl": 0.03},
+        ),
         (
             "std-1-two-envs-monte-carlo",
             "initial std 1, 2 × 1 024 steps, Monte-Carlo targets",
-            _STD_1 | {"n_envs": 2, "n_steps": 1024, "value_lambda": 1.0},
+            _STD_1_TWO_ENVS | {"value_lambda": 1.0},
         ),
     )
 }

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_gae.checks import check_finite_step
 from sb3_gae.errors import NumericalError
 from sb3_gae.networks.dense_policy import gaussian_layers
-from sb3_gae.networks.layers import activate, pair_up
+from sb3_gae.networks.layers import StepNetwork, pair_up
 from sb3_gae.rollout.episode_quota import EpisodeQuota
 
 Observations = np.ndarray | dict[str, np.ndarray]
@@ -114,10 +114,14 @@ class ActionSampler:
     def __init__(self, policy: ActorCriticPolicy, first_env: int = 0):
         self._policy = policy
         self._first_env = first_env
-        self._layers = pair_up(gaussian_layers(policy))
-        self._std = policy.log_std.detach().exp() if self._layers else None
-        if self._std is not None and (self._std == 0.0).any():
-            raise NumericalError("The policy's standard deviation is 0 in single precision; there is nothing left to explore.")
+        self._mean: StepNetwork | None = None
+        layers = pair_up(gaussian_layers(policy)) if policy.device.type == "cpu" else []
+        if layers:
+            self._mean, self._std = StepNetwork(layers), policy.log_std.detach().exp().numpy()
+            if (self._std == 0.0).any():
+                raise NumericalError(
+                    "The policy's standard deviation is 0 in single precision; there is nothing left to explore."
+                )
 
     def __call__(self, observations: Observations, step: int) -> np.ndarray:
         """
@@ -126,25 +130,23 @@ class ActionSampler:
         :return: actions as the distribution gives them, in the shape of the action space, (N, ...)
         :raises NumericalError: if an action, or a parameter of the distribution, is not finite
         """
-        try:
-            with th.no_grad():
-                actions = self._draw(obs_as_tensor(observations, self._policy.device)).cpu().numpy()
-            actions = actions.reshape(-1, *self._policy.action_space.shape)  # type: ignore[misc]
-        except ValueError as error:
-            # So torch refuses the parameters of a distribution
-            raise NumericalError(f"The action distribution is invalid at step {step} of the rollout: {error}") from error
+        if self._mean is None:
+            actions = self._ask(observations, step)
+        else:
+            actions = self._mean(observations.astype(np.float32, copy=False))  # type: ignore[union-attr]
+            # As torch's Normal draws it
+            actions += th.empty(actions.shape).normal_().numpy() * self._std
+        actions = actions.reshape(-1, *self._policy.action_space.shape)  # type: ignore[misc]
         check_finite_step("action", actions, step, self._first_env)
         return actions
 
-    def _draw(self, observations: Any) -> th.Tensor:
-        if self._std is None:
-            return self._policy._predict(observations)
-        mean = observations.float()
-        for linear, activation in self._layers:
-            mean = linear(mean)
-            if activation is not None:
-                mean = activate(activation, mean)
-        return mean + th.normal(th.zeros_like(mean), th.ones_like(mean)) * self._std
+    def _ask(self, observations: Observations, step: int) -> np.ndarray:
+        try:
+            with th.no_grad():
+                return self._policy._predict(obs_as_tensor(observations, self._policy.device)).cpu().numpy()
+        except ValueError as error:
+            # So torch refuses the parameters of a distribution
+            raise NumericalError(f"The action distribution is invalid at step {step} of the rollout: {error}") from error
 
 
 def environment_actions(policy: ActorCriticPolicy, actions: np.ndarray) -> np.ndarray:

@@ -129,11 +129,18 @@ class GAERolloutBuffer(RolloutBuffer):
         """
         if counts is not None:
             self.mask[self.pos] = counts
+        self._store_observations(obs)
+        self.actions[self.pos] = action.reshape(self.n_envs, self.action_dim)
+        self.rewards[self.pos] = reward
+        self.episode_starts[self.pos] = episode_start
         self.terminated[self.pos] = done & ~truncated
         self.truncated[self.pos] = truncated
         self._endings_known = True
-        unknown = th.zeros(self.n_envs)
-        self.add(obs, action, reward, episode_start, unknown, unknown)  # type: ignore[arg-type]
+        self.pos += 1
+        self.full = self.pos == self.buffer_size
+
+    def _store_observations(self, obs: Any) -> None:
+        self.observations[self.pos] = obs.reshape(self.n_envs, *self.obs_shape)
 
     def finish(self) -> None:
         """Call the buffer full: what has been stored is the whole batch."""
@@ -248,6 +255,10 @@ class GAEDictRolloutBuffer(GAERolloutBuffer, DictRolloutBuffer):
     """The same for Dict observations: ``observations`` is a dictionary of arrays of shape (T, N, ...)."""
 
     observations: dict[str, np.ndarray]
+
+    def _store_observations(self, obs: Any) -> None:
+        for key, array in self.observations.items():
+            array[self.pos] = obs[key].reshape(array.shape[1:])
 
     def _get_samples(self, batch_inds: np.ndarray | slice, env: VecNormalize | None = None) -> Any:
         observations = {key: self._samples_of(array, batch_inds) for key, array in self.observations.items()}
