@@ -12,6 +12,7 @@ from benchmarks.speed import results
 from benchmarks.speed.iteration_cases import BIPED, CHEETAH, CHEETAH_ENVS, tasks
 from benchmarks.speed.stopwatch import POLICY_STEP, ROLLOUT, UPDATE, VALUE_FIT, Section, Stopwatch
 from sb3_gae import TRPOGAE, on_policy_algorithm
+from sb3_gae.rollout import collection
 from sb3_gae.rollout.collection import ActionSampler
 from sb3_gae.update import trust_region
 from sb3_gae.update.kronecker import KroneckerPreconditioner
@@ -37,7 +38,7 @@ def watch(stopwatch: Stopwatch, learner: Learner) -> None:
     base: Any = env.unwrapped
     physics, calls = physics_of(base)
     stopwatch.watch(Section(ROLLOUT, "bookkeeping"), model, "collect_rollouts")
-    stopwatch.watch(Section(ROLLOUT, "normalisation"), env, "step_wait")
+    stopwatch.watch(Section(ROLLOUT, "normalisation"), collection, "step_environments")
     stopwatch.watch(Section(ROLLOUT, "rewards and endings"), base, "step_async", "step_wait")
     stopwatch.watch(Section(ROLLOUT, "resets"), base, "_restart_envs")
     stopwatch.watch(Section(ROLLOUT, "physics"), physics, *calls)

@@ -15,6 +15,7 @@ from sb3_gae.errors import NumericalError
 from sb3_gae.networks.dense_policy import gaussian_layers
 from sb3_gae.networks.layers import StepNetwork, pair_up
 from sb3_gae.rollout.episode_quota import EpisodeQuota
+from sb3_gae.rollout.normalized_steps import step_environments
 
 Observations = np.ndarray | dict[str, np.ndarray]
 
@@ -193,7 +194,7 @@ def take_steps(
             policy.reset_noise(env.num_envs)
         actions = sample(observations, step)
         clipped_actions = environment_actions(policy, actions)
-        result = env.step(clipped_actions)
+        result = step_environments(env, clipped_actions)
         new_observations, (_, rewards, dones, infos) = cast(Observations, result[0]), result
         check_finite_step("reward", rewards, step, first_env)
         check_finite_step("observation", new_observations, step + 1, first_env)
