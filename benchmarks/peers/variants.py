@@ -113,21 +113,13 @@ CANDIDATES = {
         ("std-1-kl-.05", "initial std 1, KL 0.05", _STD_1 | {"target_kl": 0.05}),
         ("std-1-one-value-step", "initial std 1, one value step", _STD_1 | {"vf_steps": 1}),
         ("std-1-epsilon-.02", "initial std 1, five value steps at ε = 0.02", _STD_1 | {"vf_trust_region": 0.02}),
+        ("std-1-value-damping-.1", "initial std 1, damping of the value fit 0.1", _STD_1 | {"vf_cg_damping": 0.1}),
+        ("std-1-value-damping-1", "initial std 1, damping of the value fit 1", _STD_1 | {"vf_cg_damping": 1.0}),
         ("std-1-adam", "initial std 1, value function fitted by Adam", _STD_1 | _ADAM),
         ("std-1-adam-kl-.05", "initial std 1, value function fitted by Adam, KL 0.05", _STD_1 | _ADAM | {"target_kl": 0.05}),
         ("std-1-envs-32", "initial std 1, 32 environments × 64 steps", _STD_1 | {"n_envs": 32, "n_steps": 64}),
         ("std-1-two-envs", "initial std 1, 2 × 1 024 steps", _STD_1_TWO_ENVS),
         ("std-1-two-envs-kl-.03", "initial std 1, 2 × 1 024 steps, KL 0.03", _STD_1_TWO_ENVS | {"target_kl": 0.03}),
-        (
-            "std-1-two-envs-kl-.03-lambda-.98",
-            "initial std 1, 2 × 1 024 steps, KL 0.03, λ 0.98",
-            _STD_1_TWO_ENVS | {"target_kl": 0.03, "gae_lambda": 0.98},
-        ),
-        (
-            "two-envs-kl-.03",
-            "… 2 × 1 024 steps, KL 0.03",
-            {"n_envs": 2, "n_steps": 1024, "target_kl": 0.03},
-        ),
         (
             "std-1-two-envs-monte-carlo",
             "initial std 1, 2 × 1 024 steps, Monte-Carlo targets",
