@@ -106,6 +106,8 @@ CANDIDATES = {
         ("std-.6", "initial std e^-½", {"policy_kwargs": "dict(log_std_init=-0.5)"}),
         ("std-1", "initial std 1", _STD_1),
         ("std-1-kl-.03", "initial std 1, KL 0.03", _STD_1 | {"target_kl": 0.03}),
+        ("std-1-kl-.005", "initial std 1, KL 0.005", _STD_1 | {"target_kl": 0.005}),
+        ("std-1-kl-.02-large-batch", "initial std 1, KL 0.02, 8 × 512 steps", _STD_1 | {"target_kl": 0.02, "n_steps": 512}),
         ("std-1-kl-.03-lambda-.9", "initial std 1, KL 0.03, λ 0.9", _STD_1 | {"target_kl": 0.03, "gae_lambda": 0.9}),
         ("std-1-kl-.03-lambda-.98", "initial std 1, KL 0.03, λ 0.98", _STD_1 | {"target_kl": 0.03, "gae_lambda": 0.98}),
         ("std-1-lambda-.9", "initial std 1, λ 0.9", _STD_1 | {"gae_lambda": 0.9}),
