@@ -116,6 +116,20 @@ def test_others_are_asked_themselves(kwargs: dict[str, Any]) -> None:
     assert ActionSampler(policy)._mean is None
 
 
+class DoubledLinear(nn.Linear):
+    """Does more than its class says."""
+
+    def forward(self, inputs: th.Tensor) -> th.Tensor:
+        return 2.0 * super().forward(inputs)
+
+
+def test_layers_of_one_s_own_are_asked_themselves() -> None:
+    policy = small_model(vec_env()).policy
+    layer = policy.action_net
+    policy.action_net = DoubledLinear(layer.in_features, layer.out_features)
+    assert ActionSampler(policy)._mean is None
+
+
 def test_parameters_that_are_no_numbers_are_found() -> None:
     policy = small_model(vec_env()).policy
     with th.no_grad():

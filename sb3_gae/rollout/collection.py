@@ -9,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
 from sb3_gae.checks import check_finite_step
 from sb3_gae.errors import NumericalError
@@ -116,8 +117,9 @@ class ActionSampler:
         self._policy = policy
         self._first_env = first_env
         self._mean: StepNetwork | None = None
-        layers = pair_up(gaussian_layers(policy)) if policy.device.type == "cpu" else []
-        if layers:
+        layers = pair_up(gaussian_layers(policy))
+        # A subclass may do more than multiply and add
+        if layers and policy.device.type == "cpu" and all(type(linear) is nn.Linear for linear, _ in layers):
             self._mean, self._std = StepNetwork(layers), policy.log_std.detach().exp().numpy()
             if (self._std == 0.0).any():
                 raise NumericalError(
