@@ -115,6 +115,11 @@ CANDIDATES = {
         ("std-1-kl-.05", "initial std 1, KL 0.05", _STD_1 | {"target_kl": 0.05}),
         ("std-1-one-value-step", "initial std 1, one value step", _STD_1 | {"vf_steps": 1}),
         ("std-1-epsilon-.02", "initial std 1, five value steps at ε = 0.02", _STD_1 | {"vf_trust_region": 0.02}),
+        (
+            "std-1-exact-solves",
+            "initial std 1, up to 25 steps of conjugate gradient to a tolerance of 0.001",
+            _STD_1 | {"cg_tolerance": 0.001, "cg_max_steps": 25, "vf_cg_max_steps": 25},
+        ),
         ("std-1-value-damping-.1", "initial std 1, damping of the value fit 0.1", _STD_1 | {"vf_cg_damping": 0.1}),
         ("std-1-value-damping-1", "initial std 1, damping of the value fit 1", _STD_1 | {"vf_cg_damping": 1.0}),
         ("std-1-adam", "initial std 1, value function fitted by Adam", _STD_1 | _ADAM),
