@@ -120,6 +120,7 @@ CANDIDATES = {
             "initial std 1, up to 25 steps of conjugate gradient to a tolerance of 0.001",
             _STD_1 | {"cg_tolerance": 0.001, "cg_max_steps": 25, "vf_cg_max_steps": 25},
         ),
+        ("std-1-damping-1", "initial std 1, damping of the policy step 1", _STD_1 | {"cg_damping": 1.0}),
         ("std-1-value-damping-.1", "initial std 1, damping of the value fit 0.1", _STD_1 | {"vf_cg_damping": 0.1}),
         ("std-1-value-damping-1", "initial std 1, damping of the value fit 1", _STD_1 | {"vf_cg_damping": 1.0}),
         ("std-1-adam", "initial std 1, value function fitted by Adam", _STD_1 | _ADAM),
