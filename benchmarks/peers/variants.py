@@ -120,6 +120,8 @@ CANDIDATES = {
             "initial std 1, up to 25 steps of conjugate gradient to a tolerance of 0.001",
             _STD_1 | {"cg_tolerance": 0.001, "cg_max_steps": 25, "vf_cg_max_steps": 25},
         ),
+        ("std-1-monte-carlo", "initial std 1, Monte-Carlo targets", _STD_1 | {"value_lambda": 1.0}),
+        ("std-1-fifteen-value-steps", "initial std 1, fifteen value steps", _STD_1 | {"vf_steps": 15}),
         ("std-1-damping-1", "initial std 1, damping of the policy step 1", _STD_1 | {"cg_damping": 1.0}),
         ("std-1-value-damping-.1", "initial std 1, damping of the value fit 0.1", _STD_1 | {"vf_cg_damping": 0.1}),
         ("std-1-value-damping-1", "initial std 1, damping of the value fit 1", _STD_1 | {"vf_cg_damping": 1.0}),
