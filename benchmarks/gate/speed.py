@@ -10,6 +10,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from benchmarks.update_speed import Update, ours, theirs
 from sb3_gae import TRPOGAE
 from sb3_gae.batch import standardized
+from sb3_gae.rollout.collection import ActionSampler
 from sb3_gae.rollout.evaluation import training_batch
 from sb3_gae.vec_env.choice import batched_vec_env
 
@@ -17,6 +18,8 @@ BATCH = 12_288
 N_ENVS, N_STEPS = 64, 64
 #: one whose physics takes most of a rollout, and one whose physics takes little: there what is done around it shows
 ROLLOUT_TASKS = ("GaeBiped-v0", "GaeCartPole-v0")
+#: where a step costs what its Python does
+N_FEW_ENVS, N_CALLS = 8, 100
 ROUNDS = 9
 
 
@@ -25,7 +28,11 @@ def speed_ratios() -> dict[str, float]:
     :return: by name; the smaller the faster
     """
     th.set_num_threads(1)
-    return update_ratios() | {f"rollout / physics, {task}": rollout_ratio(task) for task in ROLLOUT_TASKS}
+    return (
+        update_ratios()
+        | {"actions / policy's own": actions_ratio()}
+        | {f"rollout / physics, {task}": rollout_ratio(task) for task in ROLLOUT_TASKS}
+    )
 
 
 def update_ratios() -> dict[str, float]:
@@ -74,6 +81,28 @@ def rollout_ratio(task: str) -> float:
         }
     )
     return times["rollout"] / times["physics"]
+
+
+def actions_ratio() -> float:
+    """
+    :return: the actions of a few environments in each of a hundred steps over those of the policy's own method
+    """
+    policy = ours(BATCH).policy
+    observations = np.random.default_rng(0).standard_normal((N_FEW_ENVS, *policy.observation_space.shape)).astype(np.float32)
+    sample, tensor = ActionSampler(policy), th.as_tensor(observations)
+
+    @th.no_grad()
+    def ask_policy() -> None:
+        for _ in range(N_CALLS):
+            policy._predict(tensor)
+
+    times = least_seconds(
+        {
+            "actions": (lambda: [sample(observations, step) for step in range(N_CALLS)], None),
+            "policy": (ask_policy, None),
+        }
+    )
+    return times["actions"] / times["policy"]
 
 
 def forward_and_backward(model: TRPOGAE) -> None:
