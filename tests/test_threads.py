@@ -93,6 +93,9 @@ def test_a_gaussian_mlp_draws_the_policy_s_actions(
     model = small_model(vec_env(lambda: AnySpacesEnv(observation_space)), policy_kwargs=architecture)
     policy = model.policy
     with th.no_grad():
+        # Biases begin at 0, and one that is forgotten would not show
+        for parameter in policy.parameters():
+            parameter.add_(0.1 * th.randn_like(parameter))
         policy.log_std.copy_(th.tensor([-0.7, 0.3]))
     sample = ActionSampler(policy)
     assert sample._mean is not None
