@@ -65,8 +65,11 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
         check_number("value_lambda", values["value_lambda"], 0.0, 1.0)
     for name in ("target_kl", "vf_trust_region"):
         check_number(name, values[name], 0.0, above=True, below=True)
-    for name in ("cg_damping", "vf_cg_damping"):
-        check_number(name, values[name], 0.0, below=True)
+    check_number("cg_damping", values["cg_damping"], 0.0, below=True)
+    if isinstance(values["vf_cg_damping"], str):
+        check_choice("vf_cg_damping", values["vf_cg_damping"], ("auto",))
+    else:
+        check_number("vf_cg_damping", values["vf_cg_damping"], 0.0, below=True)
     for name in ("cg_tolerance", "vf_kl_fraction"):
         check_number(name, values[name], 0.0, 1.0, below=True)
     check_number("line_search_shrinking_factor", values["line_search_shrinking_factor"], 0.0, 1.0, above=True, below=True)

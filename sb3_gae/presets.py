@@ -20,5 +20,5 @@ CARTPOLE_NETWORKS: dict[str, Any] = dict(net_arch=dict(pi=[], vf=[20]), activati
 LOCOMOTION_NETWORKS: dict[str, Any] = dict(net_arch=dict(pi=[100, 50, 25], vf=[100, 50, 25]), activation_fn=nn.Tanh)
 
 #: the value fit of section 5: Monte-Carlo targets, and one trust-region step a batch. Meant for the paper's batches of
-#: 50 000 steps and more. The paper does not give ε; this one is ours
-PAPER_VALUE_FIT: dict[str, Any] = dict(value_lambda=1.0, vf_trust_region=0.01, vf_steps=1)
+#: 50 000 steps and more. The paper gives neither ε nor a damping; these are ours
+PAPER_VALUE_FIT: dict[str, Any] = dict(value_lambda=1.0, vf_trust_region=0.01, vf_steps=1, vf_cg_damping=0.01)

@@ -22,7 +22,7 @@ from sb3_gae.update.policy_step import policy_parameters, policy_step
 from sb3_gae.update.shared_parameters import ParameterGroups, SharedParameters, policy_step_radius, shared_parameters
 from sb3_gae.update.summary import update_summary
 from sb3_gae.update.trust_region import StepRecord, TrustRegionSettings
-from sb3_gae.update.value_step import ValueFitRecord, value_parameters, value_steps
+from sb3_gae.update.value_step import ValueFitRecord, automatic_damping, value_parameters, value_steps
 from sb3_gae.workers.ray_vec_env import env_on_workers
 
 
@@ -73,7 +73,9 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
         :math:`\epsilon`, where :math:`\sigma^2` is the mean squared error before the step. No units
     :param vf_steps: largest number of value steps a rollout
     :param vf_cg_max_steps: largest number of conjugate-gradient steps for a value step
-    :param vf_cg_damping: added to the diagonal of the Gauss-Newton matrix over :math:`\sigma^2` while solving
+    :param vf_cg_damping: added to the diagonal of the Gauss-Newton matrix while solving, in units of :math:`\sigma^2` before
+        the first step of a batch; the larger, the less of the batch's noise is fitted. ``"auto"`` for
+        600 over the number of samples (:func:`~sb3_gae.update.value_step.automatic_damping`)
     :param vf_kl_fraction: part of ``target_kl`` by which the value fit of an iteration may move the policy, through
         parameters that both depend on. The policy step then keeps to :math:`(1 - \sqrt f)^2` of ``target_kl``, so that both
         together stay about within it. 0 leaves these parameters to the policy step alone, and without such parameters the
@@ -142,7 +144,7 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
         vf_trust_region: float = 0.2,
         vf_steps: int = 5,
         vf_cg_max_steps: int = 10,
-        vf_cg_damping: float = 1e-2,
+        vf_cg_damping: float | str = "auto",
         vf_kl_fraction: float = 0.0,
         cg_tolerance: float = 0.1,
         vf_optimizer: str = "trust_region",
@@ -276,10 +278,11 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
             head.update_scale(batch.value_targets)
         if self.vf_optimizer == "adam":
             return adam_fit(self.policy, parameters.of_value, self.rollout_buffer, self.n_critic_updates, self.batch_size)
+        damping = self.vf_cg_damping
         settings = TrustRegionSettings(
             radius=self.vf_trust_region,
             cg_max_steps=self.vf_cg_max_steps,
-            cg_damping=self.vf_cg_damping,
+            cg_damping=automatic_damping(len(batch)) if isinstance(damping, str) else damping,
             cg_progress_tolerance=self.cg_tolerance,
             shrinking_factor=self.line_search_shrinking_factor,
             max_trials=self.line_search_max_iter,

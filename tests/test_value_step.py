@@ -15,7 +15,13 @@ from sb3_gae.networks.parameters import flatten
 from sb3_gae.update import value_step
 from sb3_gae.update.policy_step import policy_parameters
 from sb3_gae.update.trust_region import TrustRegionSettings
-from sb3_gae.update.value_step import ValueFitRecord, value_parameters, value_steps
+from sb3_gae.update.value_step import (
+    PRIOR_PRECISION,
+    ValueFitRecord,
+    automatic_damping,
+    value_parameters,
+    value_steps,
+)
 
 BOX = ACTION_SPACES["Box"]
 EXACT = TrustRegionSettings(radius=0.05, cg_max_steps=300, cg_damping=0.0, max_scale=1.0)
@@ -239,14 +245,52 @@ def test_dense_and_autograd_steps_are_the_same(kwargs: dict, monkeypatch: pytest
 
 
 @each_kind
-def test_several_steps_are_single_steps_one_after_another(kwargs: dict) -> None:
+@pytest.mark.parametrize("damping", [1e-2, 0.5])
+def test_several_steps_are_single_steps_with_one_damping_of_the_undivided_matrix(kwargs: dict, damping: float) -> None:
     together, one_by_one = (double_policy(BOX, **kwargs) for _ in range(2))
     batch = training_batch(together)
-    records = fit(together, batch, DAMPED, n_steps=4).steps
-    singles = [fit(one_by_one, batch, DAMPED).steps[0] for _ in range(4)]
+    settings = replace(DAMPED, cg_damping=damping)
+    first_variance = variance_of(together, batch)
+    records = fit(together, batch, settings, n_steps=4).steps
+    singles = []
+    for _ in range(4):
+        of_this_step = damping * first_variance / variance_of(one_by_one, batch)
+        singles += fit(one_by_one, batch, replace(settings, cg_damping=of_this_step)).steps
     assert [record.trials for record in records] == [single.trials for single in singles]
     assert [record.divergence for record in records] == pytest.approx([single.divergence for single in singles], rel=1e-6)
     th.testing.assert_close(values_of(together, batch), values_of(one_by_one, batch), rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("n_steps", [1, 2, 5])
+@pytest.mark.parametrize("damping", [1e-2, 0.5])
+def test_steps_of_linear_values_are_ridge_regressions_from_where_each_begins(n_steps: int, damping: float) -> None:
+    policy = double_policy(BOX, **LINEAR)
+    batch = training_batch(policy)
+    parameters = value_parameters_of(policy, batch)
+    rows = jacobian(lambda: policy.predict_values(batch.observations), parameters)
+    errors = batch.value_targets - values_of(policy, batch)
+    penalty = damping * errors.square().mean() / batch.value_targets.square().mean()
+    matrix = rows.t() @ rows / len(batch) + penalty * th.eye(rows.shape[1], dtype=th.float64)
+    # What a step leaves of the errors: iterated Tikhonov regularisation
+    left = th.eye(len(batch), dtype=th.float64) - rows @ th.linalg.solve(matrix, rows.t()) / len(batch)
+    fit(policy, batch, replace(EXACT, radius=1e9, cg_damping=damping), n_steps)
+    expected = th.linalg.matrix_power(left, n_steps) @ errors
+    th.testing.assert_close(batch.value_targets - values_of(policy, batch), expected, rtol=1e-6, atol=1e-8)
+
+
+def test_the_automatic_damping_is_a_prior_on_how_far_parameters_move() -> None:
+    """The mean of a Bayesian's belief about linear values, whose prior knows nothing of the number of samples."""
+    policy = double_policy(BOX, **LINEAR)
+    batch = training_batch(policy)
+    parameters = value_parameters_of(policy, batch)
+    rows = jacobian(lambda: policy.predict_values(batch.observations), parameters)
+    errors = batch.value_targets - values_of(policy, batch)
+    before = flatten(parameters)
+    noise = errors.square().mean() / batch.value_targets.square().mean()
+    precision = PRIOR_PRECISION * th.eye(rows.shape[1], dtype=th.float64)
+    posterior_mean = th.linalg.solve(rows.t() @ rows / noise + precision, rows.t() @ errors / noise)
+    fit(policy, batch, replace(EXACT, radius=1e9, cg_damping=automatic_damping(len(batch))))
+    th.testing.assert_close(flatten(parameters) - before, posterior_mean, rtol=1e-6, atol=1e-9)
 
 
 @each_kind

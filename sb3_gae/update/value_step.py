@@ -25,6 +25,9 @@ from sb3_gae.update.kronecker import NOTHING_ADDED, KroneckerPreconditioner, Out
 from sb3_gae.update.shared_parameters import SharedParameters, SharedStep
 from sb3_gae.update.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
 
+#: prior precision of a parameter's move in a batch, for targets of mean square 1; see ``benchmarks/value_fit_error.py``
+PRIOR_PRECISION = 600.0
+
 
 def value_parameters(
     policy: ActorCriticPolicy, batch: TrainingBatch, policy_parameters: Sequence[th.Tensor]
@@ -56,6 +59,20 @@ class ValueFitRecord:
     policy_kl: float | None = None
 
 
+def automatic_damping(n_samples: int) -> float:
+    r"""
+    Damping that lets a batch say less the fewer samples it has.
+
+    Ridge regression that takes the errors of the batch for noise of variance :math:`\sigma^2`, and has a normal prior of
+    precision c on how far each parameter moves, has the matrix :math:`\sum_t J_t J_t^\top + c \sigma^2 I`. Divided by the
+    number of samples n, as the Gauss-Newton matrix here is, the prior adds c / n times :math:`\sigma^2`.
+
+    :param n_samples: in the batch
+    :return: what is to be added to the diagonal of the Gauss-Newton matrix, in units of :math:`\sigma^2`
+    """
+    return PRIOR_PRECISION / n_samples
+
+
 def value_steps(
     policy: ActorCriticPolicy,
     parameters: Sequence[th.Tensor],
@@ -73,10 +90,15 @@ def value_steps(
     rounding. With shared parameters it is the last that moves those, as is one that
     leaves no room: the value function's own may go on.
 
+    All steps have the same damping of the Gauss-Newton matrix itself, ``settings.cg_damping`` times the first step's
+    :math:`\sigma^2`. Were it times each step's own, the closer the fit, the less would hold it back from the noise of the
+    batch.
+
     :param policy: owner of the value function, in evaluation mode
     :param parameters: see :func:`value_parameters`
     :param batch: observations and value targets, B samples
-    :param settings: radius, solver and search
+    :param settings: radius, solver and search; the damping is in units of the first step's :math:`\sigma^2`, see
+        :func:`automatic_damping`
     :param n_steps: largest number of steps
     :param curvature_subset: samples to compute the curvature on, None for all
     :param shared: what is to be moved beside the parameters, within which limit; None for nothing
@@ -92,7 +114,7 @@ def value_steps(
 
     joint = shared
     fit = make_fit(parameters if joint is None else [*parameters, *joint.parameters])
-    settings = replace(settings, cg_damping=settings.cg_damping / fit.target_square)
+    damping = settings.cg_damping * fit.variance / fit.target_square
     before = fit.values
     records: list[StepRecord] = []
     for steps_left in range(n_steps, 0, -1):
@@ -104,6 +126,8 @@ def value_steps(
             break
         if fit.is_exact or not fit.parameters:
             break
+        # Of the matrix over the present variance, as the step has it
+        settings = replace(settings, cg_damping=damping / fit.variance)
         records.append(fit.step(settings) if joint is None else fit.step(settings, joint.step(fit.parameters, radius)))
     policy_kl = None if shared is None else shared.divergence()
     return ValueFitRecord(records, before * scale, fit.values * scale, policy_kl)
