@@ -42,7 +42,13 @@ def test_an_argument_outside_its_domain_is_refused_by_name(name: str, value: Any
     ("name", "value"),
     [
         *[(name, value) for name in ("gamma", "gae_lambda", "value_lambda") for value in (0, 0.0, 1, np.float32(0.5))],
-        *[("cg_damping", 0.0), ("vf_cg_damping", 0.0), ("vf_cg_damping", "auto"), ("curvature_samples", None), ("curvature_samples", 2)],
+        *[
+            ("cg_damping", 0.0),
+            ("vf_cg_damping", 0.0),
+            ("vf_cg_damping", "auto"),
+            ("curvature_samples", None),
+            ("curvature_samples", 2),
+        ],
         *[("target_kl", 1e-12), ("target_kl", 100.0), ("vf_trust_region", 1e-12), ("vf_trust_region", 100.0)],
         *[("cg_max_steps", 1), ("vf_cg_max_steps", np.int64(1)), ("line_search_max_iter", 1), ("vf_steps", 0)],
         *[("vf_kl_fraction", value) for value in (0, 1e-12, np.float32(0.99))],

@@ -123,8 +123,6 @@ CANDIDATES = {
         ("std-1-monte-carlo", "initial std 1, Monte-Carlo targets", _STD_1 | {"value_lambda": 1.0}),
         ("std-1-fifteen-value-steps", "initial std 1, fifteen value steps", _STD_1 | {"vf_steps": 15}),
         ("std-1-damping-1", "initial std 1, damping of the policy step 1", _STD_1 | {"cg_damping": 1.0}),
-        ("std-1-value-damping-.1", "initial std 1, damping of the value fit 0.1", _STD_1 | {"vf_cg_damping": 0.1}),
-        ("std-1-value-damping-1", "initial std 1, damping of the value fit 1", _STD_1 | {"vf_cg_damping": 1.0}),
         ("std-1-adam", "initial std 1, value function fitted by Adam", _STD_1 | _ADAM),
         ("std-1-adam-kl-.05", "initial std 1, value function fitted by Adam, KL 0.05", _STD_1 | _ADAM | {"target_kl": 0.05}),
         ("std-1-envs-32", "initial std 1, 32 environments × 64 steps", _STD_1 | {"n_envs": 32, "n_steps": 64}),
@@ -134,6 +132,15 @@ CANDIDATES = {
             "std-1-two-envs-monte-carlo",
             "initial std 1, 2 × 1 024 steps, Monte-Carlo targets",
             _STD_1_TWO_ENVS | {"value_lambda": 1.0},
+        ),
+        # All above were run when the damping of the value fit was 0.01 of each step's own error; these are since
+        ("one-damping-kl-.01", "one damping: initial std 1, KL 0.01", _STD_1),
+        ("one-damping-kl-.03", "one damping: initial std 1, KL 0.03", _STD_1 | {"target_kl": 0.03}),
+        ("one-damping-two-envs", "one damping: initial std 1, 2 × 1 024 steps", _STD_1_TWO_ENVS),
+        (
+            "one-damping-two-envs-lambda-.98",
+            "one damping: initial std 1, 2 × 1 024 steps, λ 0.98",
+            _STD_1_TWO_ENVS | {"gae_lambda": 0.98},
         ),
     )
 }
