@@ -136,6 +136,12 @@ CANDIDATES = {
         # All above were run when the damping of the value fit was 0.01 of each step's own error; these are since
         ("one-damping-kl-.01", "one damping: initial std 1, KL 0.01", _STD_1),
         ("one-damping-kl-.03", "one damping: initial std 1, KL 0.03", _STD_1 | {"target_kl": 0.03}),
+        ("one-damping-.01", "one damping, of 0.01: initial std 1, KL 0.01", _STD_1 | {"vf_cg_damping": 0.01}),
+        (
+            "one-damping-.01-kl-.03",
+            "one damping, of 0.01: initial std 1, KL 0.03",
+            _STD_1 | {"vf_cg_damping": 0.01, "target_kl": 0.03},
+        ),
         ("one-damping-two-envs", "one damping: initial std 1, 2 × 1 024 steps", _STD_1_TWO_ENVS),
         (
             "one-damping-two-envs-lambda-.98",
