@@ -129,7 +129,7 @@ def rows_of(env_id: str, seed: int) -> Iterator[dict[str, Any]]:
     settings = settings_for(yaml.safe_load(default_hyperparams_path().read_text()), env_id, "trpo_gae.yml")
     pool: Any = EnvPoolVecEnv
     env = make_vec_env(env_id, settings["n_envs"], seed, vec_env_cls=pool, vec_env_kwargs=dict(n_threads=1))
-    names = ("n_steps", "gamma", "gae_lambda", "target_kl")
+    names = ("n_steps", "gamma", "gae_lambda", "target_kl", "vf_cg_damping")
     model = TRPOGAE(
         settings["policy"],
         VecNormalize(env, norm_reward=False),
