@@ -11,11 +11,13 @@ from sb3_gae.sweep.grid import Cell
 from sb3_gae.sweep.plan import Options
 from sb3_gae.sweep.recorder import Row
 
-#: with the shipped settings. HalfCheetah tells what CartPole does not: there a value function that is fitted before the
-#: policy step takes most of the gradient with it
+_HALF_CHEETAH = Cell("HalfCheetah-v5", "trust_region", 0.99, 0.95, seed=0, iterations=24)
+#: two with the shipped settings. The third tells what they do not: a value function that follows a batch closely takes most
+#: of the gradient with it where it is fitted before the policy step
 RUNS = {
     "CartPole-v1": Cell("CartPole-v1", "trust_region", 0.98, 0.98, seed=0, iterations=20),
-    "HalfCheetah-v5": Cell("HalfCheetah-v5", "trust_region", 0.99, 0.95, seed=0, iterations=24),
+    "HalfCheetah-v5": _HALF_CHEETAH,
+    "HalfCheetah-v5, close fit": replace(_HALF_CHEETAH, overrides='{"vf_cg_damping": 0.001, "vf_steps": 10}'),
 }
 #: of the gate; what it is judged by is recorded with others
 SEEDS = range(12)
