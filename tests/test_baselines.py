@@ -143,7 +143,7 @@ def test_advantages_of_whole_episodes_have_mean_0_at_each_timestep() -> None:
 def test_a_value_function_fitted_first_is_the_one_behind_the_advantages() -> None:
     logs, spread = [], []
     for first in (False, True):
-        settings_ = {"vf_steps": 30, "gae_lambda": 1.0, "policy_kwargs": {"net_arch": [128]}}
+        settings_ = {"vf_steps": 30, "vf_cg_damping": 0.01, "gae_lambda": 1.0, "policy_kwargs": {"net_arch": [128]}}
         model = small_model(vec_env(n_envs=4), n_steps=64, value_fit_first=first, **settings_)
         logs.append(train_once(model))
         buffer = model.rollout_buffer

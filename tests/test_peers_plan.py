@@ -82,9 +82,10 @@ def test_classic_control_has_the_steps_of_the_zoo() -> None:
 
 
 def test_variants_undo_a_choice() -> None:
-    shipped = settings_of(Cell("Hopper-v5", OURS, "", 0, 1_000_000))
+    # Not on Hopper, whose shipped fit is as close as one of the variants
+    shipped = settings_of(Cell("HalfCheetah-v5", OURS, "", 0, 1_000_000))
     for name, variant in VARIANTS.items():
-        changed = settings_of(Cell("Hopper-v5", OURS, name, 0, 1_000_000))
+        changed = settings_of(Cell("HalfCheetah-v5", OURS, name, 0, 1_000_000))
         assert (changed != shipped) == bool(variant.overrides)
 
 
