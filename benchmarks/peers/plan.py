@@ -6,7 +6,7 @@ from typing import NamedTuple
 from benchmarks.peers.algorithms import A2C, OURS, PPO, TIANSHOU_NPG, TIANSHOU_TRPO, TRPO
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, MUJOCO_TASKS, PUBLISHED_PPO
-from benchmarks.peers.variants import CANDIDATES, PENDULUM_CANDIDATES, SHIPPED, VARIANTS
+from benchmarks.peers.variants import CANDIDATES, PENDULUM_CANDIDATES, SHIPPED, SWIMMER_CANDIDATES, VARIANTS
 
 #: of ours and of the peers that the targets name
 SEEDS = 5
@@ -23,6 +23,11 @@ TUNING_STEPS = 500_000
 PENDULUM = "Pendulum-v1"
 #: as many as tell a tenth of the return from chance
 PENDULUM_TUNING_SEEDS = range(100, 106)
+SWIMMER = "Swimmer-v5"
+#: as many as tell a quarter of all agents from half of them
+SWIMMER_TUNING_SEEDS = range(110, 118)
+#: by when it has been decided
+SWIMMER_TUNING_STEPS = 200_000
 
 
 class Cell(NamedTuple):
@@ -31,7 +36,7 @@ class Cell(NamedTuple):
 
     :param task: id of the environment
     :param algorithm: a key of :data:`~benchmarks.peers.algorithms.ALGORITHMS`
-    :param variant: a key of :data:`~benchmarks.peers.variants.VARIANTS` or ``CANDIDATES``; only ours has others than the first
+    :param variant: a key of :data:`~benchmarks.peers.variants.EVERY_VARIANT`; only ours has others than the first
     :param seed: of the training
     :param steps: of the training
     """
@@ -95,10 +100,10 @@ def _tuning(steps: int) -> Iterator[Cell]:
                 yield Cell(task, OURS, variant, seed, steps)
 
 
-def _pendulum() -> Iterator[Cell]:
-    for seed in PENDULUM_TUNING_SEEDS:
-        for variant in PENDULUM_CANDIDATES:
-            yield Cell(PENDULUM, OURS, variant, seed, CLASSIC_TASKS[PENDULUM])
+def _tuning_of(task: str, candidates: Iterable[str], seeds: Iterable[int], steps: int) -> Iterator[Cell]:
+    for seed in seeds:
+        for variant in candidates:
+            yield Cell(task, OURS, variant, seed, steps)
 
 
 def _mujoco() -> Iterator[Cell]:
@@ -116,6 +121,7 @@ PRESETS: dict[str, tuple[Cell, ...]] = {
     "tuning": tuple(_tuning(TUNING_STEPS)),
     # What learns sooner need not end higher
     "tuning-long": tuple(_tuning(MUJOCO_STEPS)),
-    "tuning-pendulum": tuple(_pendulum()),
+    "tuning-pendulum": tuple(_tuning_of(PENDULUM, PENDULUM_CANDIDATES, PENDULUM_TUNING_SEEDS, CLASSIC_TASKS[PENDULUM])),
+    "tuning-swimmer": tuple(_tuning_of(SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_SEEDS, SWIMMER_TUNING_STEPS)),
     "smoke": tuple(_seed_major({"CartPole-v1": SMOKE_STEPS}, {OURS: 1, TRPO: 1})),
 }

@@ -12,7 +12,7 @@ from benchmarks.peers.algorithms import ALGORITHMS, OURS
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.plan import Cell
 from benchmarks.peers.tianshou_settings import TIANSHOU_SETTINGS
-from benchmarks.peers.variants import CANDIDATES, PENDULUM_CANDIDATES, VARIANTS
+from benchmarks.peers.variants import EVERY_VARIANT
 
 _OUR_FILE = Path(__file__).parents[2] / "hyperparams" / "trpo_gae.yml"
 
@@ -27,7 +27,7 @@ def settings_of(cell: Cell) -> dict[str, Any]:
         return TIANSHOU_SETTINGS[cell.algorithm] | {"steps": cell.steps}
     path = _OUR_FILE if cell.algorithm == OURS else zoo_file(cell.algorithm)
     shipped = settings_for(yaml.safe_load(path.read_text()), cell.task, path.name)
-    return shipped | (VARIANTS | CANDIDATES | PENDULUM_CANDIDATES)[cell.variant].overrides | {"n_timesteps": cell.steps}
+    return shipped | EVERY_VARIANT[cell.variant].overrides | {"n_timesteps": cell.steps}
 
 
 def settings_for(table: dict[str, dict[str, Any]], task: str, file: str) -> dict[str, Any]:

@@ -20,9 +20,19 @@ from benchmarks.peers.comparison import (
 )
 from benchmarks.peers.curves import Run, all_runs, runs_of, scores_of
 from benchmarks.peers.page import markdown_table
-from benchmarks.peers.plan import ABLATION_TASKS, CLASSIC_SEEDS, FEW_SEEDS, PENDULUM, SEEDS, TUNING_STEPS, TUNING_TASKS
+from benchmarks.peers.plan import (
+    ABLATION_TASKS,
+    CLASSIC_SEEDS,
+    FEW_SEEDS,
+    PENDULUM,
+    SEEDS,
+    SWIMMER,
+    SWIMMER_TUNING_STEPS,
+    TUNING_STEPS,
+    TUNING_TASKS,
+)
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, PUBLISHED_PPO
-from benchmarks.peers.variants import CANDIDATES, PENDULUM_CANDIDATES, VARIANTS
+from benchmarks.peers.variants import CANDIDATES, PENDULUM_CANDIDATES, SWIMMER_CANDIDATES, VARIANTS, Variant
 from sb3_gae.sweep.statistics import interquartile_mean
 
 #: parts of sb3-contrib TRPO's training time at which scores are compared
@@ -195,11 +205,24 @@ def pendulum_tuning_table(table: pd.DataFrame) -> str:
     :param table: of results
     :return: score of the settings that were tried on Pendulum-v1
     """
-    found = {
-        about.title: runs_of(table, PENDULUM, OURS, CLASSIC_TASKS[PENDULUM], variant)
-        for variant, about in PENDULUM_CANDIDATES.items()
-    }
-    return markdown_table(["", PENDULUM], [[title, _score(runs)] for title, runs in found.items() if runs])
+    found = _tried_on(table, PENDULUM, PENDULUM_CANDIDATES, CLASSIC_TASKS[PENDULUM])
+    return markdown_table(["", PENDULUM], [[title, _score(runs)] for title, runs in found.items()])
+
+
+def swimmer_tuning_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: score of each run with the settings that were tried on Swimmer-v5, the worst first
+    """
+    found = _tried_on(table, SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_STEPS)
+    rows = [[title, ", ".join(number(run) for run in sorted(scores_of(runs))), _score(runs)] for title, runs in found.items()]
+    return markdown_table(["", "runs, the worst first", "together"], rows)
+
+
+def _tried_on(table: pd.DataFrame, task: str, candidates: dict[str, Variant], steps: int) -> dict[str, list[Run]]:
+    """Runs by the title of the settings, of those that were run."""
+    found = {about.title: runs_of(table, task, OURS, steps, variant) for variant, about in candidates.items()}
+    return {title: runs for title, runs in found.items() if runs}
 
 
 def _tried(table: pd.DataFrame, steps: int) -> str:

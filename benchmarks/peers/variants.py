@@ -173,3 +173,20 @@ PENDULUM_CANDIDATES = {
         ("sde-lambda-.99", "gSDE, λ 0.99", _SDE | {"gae_lambda": 0.99}),
     )
 }
+
+# The whole episode in a batch; the rest as for Walker2d when these were tried
+_SWIMMER = {"n_envs": 2, "n_steps": 1024, "gamma": 0.9999, "target_kl": 0.01, "cg_damping": 0.1, "gae_lambda": 0.98}
+
+#: settings that were tried on Swimmer-v5, where many agents curl up and creep: chance, which takes many seeds to see through
+SWIMMER_CANDIDATES = {
+    f"try-swimmer-{name}": Variant(title, _SWIMMER | overrides)
+    for name, title, overrides in (
+        ("lambda-.95", "λ 0.95, damping of the policy step 0.1", {"gae_lambda": 0.95}),
+        ("lambda-.98", "λ 0.98, damping of the policy step 0.1", {}),
+        ("damping-1", "λ 0.98, damping of the policy step 1", {"cg_damping": 1.0}),
+        ("damping-3", "λ 0.98, damping of the policy step 3", {"cg_damping": 3.0}),
+    )
+}
+
+#: all of them, by name
+EVERY_VARIANT = VARIANTS | CANDIDATES | PENDULUM_CANDIDATES | SWIMMER_CANDIDATES
