@@ -12,21 +12,18 @@ What is stored in results/value_fit_error.csv is not run again.
 
 import argparse
 import copy
-import csv
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch as th
-import yaml
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.vec_env import VecNormalize
 
-from benchmarks.peers.settings import settings_for
+from benchmarks.shipped_agent import shipped_agent
+from benchmarks.stored_rows import store, stored
 from sb3_gae import TRPOGAE, GAERolloutBuffer
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.estimators.measures import explained_variance
@@ -36,11 +33,9 @@ from sb3_gae.update.adam_fit import adam_fit
 from sb3_gae.update.policy_step import policy_parameters
 from sb3_gae.update.trust_region import TrustRegionSettings
 from sb3_gae.update.value_step import value_parameters, value_steps
-from sb3_gae.vec_env import EnvPoolVecEnv
-from sb3_gae.zoo import default_hyperparams_path
 
 RESULTS = Path(__file__).parent / "results" / "value_fit_error.csv"
-COLUMNS = ["env", "seed", "batch", "samples", "fit", "left_before", "left_after", "products"]
+COLUMNS = ["batch", "samples", "fit", "left_before", "left_after", "products"]
 SEEDS = (100, 101)
 #: with the number of batches
 TASKS = {"HalfCheetah-v5": 40, "Hopper-v5": 40, "Walker2d-v5": 40, "Swimmer-v5": 40}
@@ -115,7 +110,7 @@ class Onlookers(BaseCallback):
             cast(ValueHead, policy.value_net).update_scale(batch.value_targets)
             products = fit(policy, batch, rollout_buffer)
             numbers = [number, len(batch), name, before, left(policy, batch), products]
-            self.rows.append(dict(zip(COLUMNS[2:], numbers, strict=True)))
+            self.rows.append(dict(zip(COLUMNS, numbers, strict=True)))
 
 
 def left(policy: ActorCriticPolicy, batch: TrainingBatch) -> float:
@@ -126,43 +121,15 @@ def left(policy: ActorCriticPolicy, batch: TrainingBatch) -> float:
 
 
 def rows_of(env_id: str, seed: int) -> Iterator[dict[str, Any]]:
-    settings = settings_for(yaml.safe_load(default_hyperparams_path().read_text()), env_id, "trpo_gae.yml")
-    pool: Any = EnvPoolVecEnv
-    env = make_vec_env(env_id, settings["n_envs"], seed, vec_env_cls=pool, vec_env_kwargs=dict(n_threads=1))
-    names = ("n_steps", "gamma", "gae_lambda", "target_kl", "vf_cg_damping")
-    model = TRPOGAE(
-        settings["policy"],
-        VecNormalize(env, norm_reward=False),
-        policy_kwargs=eval(settings.get("policy_kwargs", "None")),  # as rl-zoo3 reads its files
-        seed=seed,
-        device="cpu",
-        **{name: settings[name] for name in names if name in settings},
-    )
-    onlookers = Onlookers()
+    model, onlookers = shipped_agent(env_id, seed), Onlookers()
     model.learn(TASKS[env_id] * model.n_steps * model.n_envs, callback=onlookers)
     for row in onlookers.rows:
         yield {"env": env_id, "seed": seed} | row
 
 
-def stored() -> list[dict[str, str]]:
-    if not RESULTS.exists():
-        return []
-    with RESULTS.open() as file:
-        return list(csv.DictReader(file))
-
-
-def store(rows: Iterable[dict[str, Any]]) -> None:
-    new = not RESULTS.exists()
-    with RESULTS.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if new:
-            writer.writeheader()
-        writer.writerows({name: f"{v:.4g}" if isinstance(v, float) else v for name, v in row.items()} for row in rows)
-
-
 def summary() -> str:
     """A table of medians over batches and seeds, the first quarter of the batches apart; after the fit in brackets."""
-    rows, names = stored(), list(FITS)
+    rows, names = stored(RESULTS), list(FITS)
     lines = ["| task | batches | " + " | ".join(names) + " |", "| --- " * (len(names) + 2) + "|"]
     for env, n_batches in TASKS.items():
         for first, end in ((1, n_batches // 4), (n_batches // 4, n_batches)):
@@ -186,11 +153,11 @@ def main() -> None:
     parser.add_argument("--summary", action="store_true", help="run nothing")
     args = parser.parse_args()
     th.set_num_threads(1)
-    known = {(row["env"], int(row["seed"])) for row in stored()}
+    known = {(row["env"], int(row["seed"])) for row in stored(RESULTS)}
     for env_id in TASKS:
         for seed in SEEDS:
             if not args.summary and (env_id, seed) not in known:
-                store(list(rows_of(env_id, seed)))
+                store(RESULTS, rows_of(env_id, seed))
     print(summary())
 
 
