@@ -38,6 +38,7 @@ SMALLER = {
     "benchmarks/first_results.py": "",
     "benchmarks/ray_scaling_model.py": "",
     "benchmarks.value_fit_error": "",
+    "benchmarks.policy_step_gain": "",
     "benchmarks.gate draw": "",
     "docs/gridworld_figures.py": "",
     "docs/training_figures.py": "",
