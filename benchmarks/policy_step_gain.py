@@ -1,7 +1,7 @@
 """
 What a policy step gains where it was not computed, by the damping of its linear system.
 
-    python -m benchmarks.policy_step_gain            # about fifteen minutes on one core
+    python -m benchmarks.policy_step_gain            # about 25 minutes on one core
     python -m benchmarks.policy_step_gain --summary  # only the table, from the stored results
 
 An agent learns with the shipped settings. Before every fifth update the step is computed from its batch with each damping,
