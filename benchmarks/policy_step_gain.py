@@ -10,9 +10,9 @@ collected. Both are in units of the advantages' deviation. None of these steps i
 What is stored in results/policy_step_gain.csv is not run again.
 """
 
-import argparse
 import copy
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,7 +23,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecNormalize
 
 from benchmarks.shipped_agent import shipped_agent
-from benchmarks.stored_rows import store, stored
+from benchmarks.stored_rows import measure, stored
 from sb3_gae import TRPOGAE
 from sb3_gae.batch import TrainingBatch, standardized
 from sb3_gae.rollout.evaluation import training_batch
@@ -139,18 +139,5 @@ def _mean(rows: list[dict[str, str]], name: str) -> float:
     return float(np.mean([float(row[name]) for row in rows] or [np.nan]))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    args = parser.parse_args()
-    th.set_num_threads(1)
-    known = {(row["env"], int(row["seed"])) for row in stored(RESULTS)}
-    for seed in SEEDS:
-        for env_id in TASKS:
-            if not args.summary and (env_id, seed) not in known:
-                store(RESULTS, rows_of(env_id, seed))
-    print(summary())
-
-
 if __name__ == "__main__":
-    main()
+    measure(__doc__, RESULTS, product(TASKS, SEEDS), rows_of, summary)

@@ -1,9 +1,12 @@
 """Rows of a CSV file that a measurement adds to as it goes, so that what is stored need not be run again."""
 
+import argparse
 import csv
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
+
+import torch as th
 
 
 def stored(path: Path) -> list[dict[str, str]]:
@@ -28,3 +31,30 @@ def store(path: Path, rows: Iterable[dict[str, Any]]) -> None:
         if new:
             writer.writeheader()
         writer.writerows({name: f"{v:.4g}" if isinstance(v, float) else v for name, v in row.items()} for row in rows)
+
+
+def measure(
+    description: str | None,
+    path: Path,
+    agents: Iterable[tuple[str, int]],
+    rows_of: Callable[[str, int], Iterable[dict[str, Any]]],
+    summary: Callable[[], str],
+) -> None:
+    """
+    The command of such a measurement: run what is not stored yet, agent by agent, and print the summary.
+
+    :param description: of the command
+    :param path: of the file
+    :param agents: task and seed of each
+    :param rows_of: measures one, with columns ``env`` and ``seed``
+    :param summary: of all that is stored
+    """
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--summary", action="store_true", help="run nothing")
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    known = {(row["env"], int(row["seed"])) for row in stored(path)}
+    for env_id, seed in agents:
+        if not args.summary and (env_id, seed) not in known:
+            store(path, rows_of(env_id, seed))
+    print(summary())

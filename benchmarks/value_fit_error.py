@@ -10,10 +10,10 @@ variance of its λ-returns do they leave? And once more after it. The λ-returns
 What is stored in results/value_fit_error.csv is not run again.
 """
 
-import argparse
 import copy
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -23,7 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from benchmarks.shipped_agent import shipped_agent
-from benchmarks.stored_rows import store, stored
+from benchmarks.stored_rows import measure, stored
 from sb3_gae import TRPOGAE, GAERolloutBuffer
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.estimators.measures import explained_variance
@@ -148,18 +148,5 @@ def _medians(rows: list[dict[str, str]]) -> str:
     return f"{before:.3f} ({after:.3f})"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--summary", action="store_true", help="run nothing")
-    args = parser.parse_args()
-    th.set_num_threads(1)
-    known = {(row["env"], int(row["seed"])) for row in stored(RESULTS)}
-    for env_id in TASKS:
-        for seed in SEEDS:
-            if not args.summary and (env_id, seed) not in known:
-                store(RESULTS, rows_of(env_id, seed))
-    print(summary())
-
-
 if __name__ == "__main__":
-    main()
+    measure(__doc__, RESULTS, product(TASKS, SEEDS), rows_of, summary)
