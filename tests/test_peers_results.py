@@ -7,13 +7,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib import rc_context
-from peers_data import ENDS, SEEDS, TASKS, a_run, results
+from peers_data import A_PROCESSOR, ENDS, SEEDS, TASKS, a_run, results
 from rliable import metrics
 
 from benchmarks.peers import aggregates, report, tables
 from benchmarks.peers.aggregates import improvement, interquartile_means, normalized, probability_of_improvement, ratio
 from benchmarks.peers.algorithms import OURS, PPO, TRPO
-from benchmarks.peers.comparison import final_scores, mujoco_runs, scores_after, time_to_reach
+from benchmarks.peers.comparison import final_scores, mujoco_runs, on_one_processor, scores_after, times_to_reach
 from benchmarks.peers.curves import Run, against_seconds, against_steps, first_reach, runs_of, scores_of
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.figures import draw_all
@@ -59,12 +59,12 @@ def test_a_score_is_the_mean_of_the_last_tenth() -> None:
     returns = np.zeros(EVALUATIONS + 1)
     returns[-4:] = [1, 2, 3, 6]
     returns[3] = 100
-    assert Run(0, np.arange(EVALUATIONS + 1), np.zeros(EVALUATIONS + 1), returns).score == 3
+    assert Run(0, np.arange(EVALUATIONS + 1), np.zeros(EVALUATIONS + 1), returns, A_PROCESSOR).score == 3
 
 
 def test_curves_are_on_a_common_grid() -> None:
-    late = Run(0, np.array([0.0, 60, 110]), np.array([0.0, 6, 11]), np.array([0.0, 60, 110]))
-    early = Run(1, np.array([0.0, 50, 100]), np.array([0.0, 10, 20]), np.array([0.0, 0, 100]))
+    late = Run(0, np.array([0.0, 60, 110]), np.array([0.0, 6, 11]), np.array([0.0, 60, 110]), A_PROCESSOR)
+    early = Run(1, np.array([0.0, 50, 100]), np.array([0.0, 10, 20]), np.array([0.0, 0, 100]), A_PROCESSOR)
     grid, returns = against_steps([late, early], 100)
     assert (grid[0], grid[-1], returns.shape) == (0, 100, (2, EVALUATIONS + 1))
     np.testing.assert_allclose(returns[0], grid)
@@ -74,18 +74,46 @@ def test_curves_are_on_a_common_grid() -> None:
 
 
 def test_first_reach() -> None:
-    run = Run(0, np.array([0.0, 10, 20]), np.array([0.0, 1, 2]), np.array([0.0, 5, 4]))
+    run = Run(0, np.array([0.0, 10, 20]), np.array([0.0, 1, 2]), np.array([0.0, 5, 4]), A_PROCESSOR)
     assert first_reach(run, 4.5) == (10, 1)
     assert first_reach(run, 6) == (np.inf, np.inf)
 
 
 def test_time_to_reach_is_part_of_the_peers_training() -> None:
-    reach = time_to_reach(mujoco_runs(TABLE)["Hopper-v5"])
+    reach = times_to_reach(mujoco_runs(TABLE))["Hopper-v5"]
     assert reach.target == pytest.approx(2001)
     # Ours climbs to 3 000 within 50 s, and is evaluated every 2.5 s; TRPO is there after half of its 400 s
     assert reach.seconds == pytest.approx(35)
     assert reach.peer_seconds == pytest.approx(200)
     assert reach.part == pytest.approx(35 / 400)
+
+
+def test_seconds_of_one_processor_only_are_compared() -> None:
+    table = TABLE[TABLE["algorithm"].isin([OURS, TRPO])].copy()
+    elsewhere = (table["algorithm"] == TRPO) & (table["seed"] == 2)
+    table.loc[elsewhere, "processor"] = "another processor"
+    table.loc[elsewhere, "cpu_seconds"] *= 100
+    runs = mujoco_runs(table)
+    assert [run.seed for run in on_one_processor(runs)["Hopper-v5"][TRPO]] == [0, 1]
+    reach = times_to_reach(runs)["Hopper-v5"]
+    assert reach.target == pytest.approx(2001), "all runs say what is to be reached"
+    assert reach.peer_training == pytest.approx(400)
+    assert scores_after(runs, 0.05)[TRPO].shape == (2, len(TASKS))
+    assert scores_after(runs, 0.05)[OURS].shape == (SEEDS, len(TASKS))
+    assert [row[-2] for row in rows_of(tables.targets_table(table))[:3]] == ["3", "3", "2"]
+
+
+def test_without_a_processor_in_common_times_are_not_compared() -> None:
+    table = TABLE.copy()
+    table.loc[(table["algorithm"] == TRPO) & (table["task"] == "Hopper-v5"), "processor"] = "another processor"
+    assert list(times_to_reach(mujoco_runs(table))) == ["HalfCheetah-v5"]
+    table.loc[table["algorithm"] == TRPO, "processor"] = "another processor"
+    sections = report.sections_of(table)
+    assert (sections["reach"], sections["clock"]) == ("", "")
+    assert "a fifth of its time" not in sections["targets"]
+    assert sections["scores"] == tables.scores_table(TABLE)
+    assert draw_all(table) == {}
+    assert sections["figure steps"] == "", "no picture that is not there"
 
 
 def test_scores_are_in_units_of_the_peers() -> None:
@@ -158,7 +186,7 @@ def test_what_trpo_does_not_learn_is_no_target() -> None:
     table = TABLE.copy()
     falls = (table["task"] == "Hopper-v5") & (table["algorithm"] == TRPO)
     table.loc[falls, "mean_return"] = 3000.0 - table.loc[falls, "mean_return"]
-    reach = time_to_reach(mujoco_runs(table)["Hopper-v5"])
+    reach = times_to_reach(mujoco_runs(table))["Hopper-v5"]
     assert not reach.is_learned
     assert rows_of(tables.reach_table(table))[1] == ["Hopper-v5", "999", "", "", "", "", "TRPO ends no higher than it begins"]
     # Reached at once, and yet not what the target asks for

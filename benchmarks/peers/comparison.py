@@ -26,6 +26,29 @@ def mujoco_runs(table: pd.DataFrame) -> Runs:
     return {task: runs for task, runs in found.items() if OURS in runs and TRPO in runs}
 
 
+def on_one_processor(runs: Runs) -> Runs:
+    """
+    :param runs: of all tasks
+    :return: of each task the runs on that processor which most of both ours and sb3-contrib's TRPO have been run on, so that
+        their seconds can be compared; without the tasks that have no such processor
+    """
+    found = {task: max(_by_processor(own), key=_fewest_of_both) for task, own in runs.items()}
+    return {task: own for task, own in found.items() if _fewest_of_both(own) > 0}
+
+
+def _by_processor(own: dict[str, list[Run]]) -> list[dict[str, list[Run]]]:
+    processors = sorted({run.processor for of_one in own.values() for run in of_one})
+    parts = [
+        {name: [run for run in of_one if run.processor == processor] for name, of_one in own.items()}
+        for processor in processors
+    ]
+    return [{name: of_one for name, of_one in part.items() if of_one} for part in parts]
+
+
+def _fewest_of_both(own: dict[str, list[Run]]) -> int:
+    return min(len(own.get(name, [])) for name in (OURS, TRPO))
+
+
 def score(runs: list[Run]) -> Interval:
     """
     :param runs: of one algorithm on one task
@@ -78,21 +101,24 @@ def scores_after(runs: Runs, fraction: float) -> Scores:
     """
     :param runs: of all tasks
     :param fraction: of the time that sb3-contrib's TRPO trains for on each task
-    :return: scores of each algorithm then, in units of sb3-contrib TRPO's at its end
+    :return: scores of each algorithm then, in units of sb3-contrib TRPO's at its end, over the tasks that
+        :func:`on_one_processor` has; the units are of all runs
     """
-    reference = [scores_of(own[TRPO]) for own in runs.values()]
-    until = [fraction * training_seconds(own[TRPO]) for own in runs.values()]
+    timed = on_one_processor(runs)
+    reference = [scores_of(runs[task][TRPO]) for task in timed]
+    until = [fraction * training_seconds(own[TRPO]) for own in timed.values()]
     return {
         name: normalized(
-            [returns_after(own[name], seconds) for own, seconds in zip(runs.values(), until, strict=True)], reference
+            [returns_after(own[name], seconds) for own, seconds in zip(timed.values(), until, strict=True)], reference
         )
-        for name in common_algorithms(runs)
+        for name in common_algorithms(timed)
     }
 
 
 class Reach(NamedTuple):
     """
-    How soon ours is where sb3-contrib's TRPO ends. Infinite where the median run never gets there.
+    How soon ours is where sb3-contrib's TRPO ends. Infinite where the median run never gets there. What has to do with time
+    is of the runs on one processor, the target of all.
 
     :param target: interquartile mean of TRPO's scores
     :param steps: median of ours
@@ -115,17 +141,21 @@ class Reach(NamedTuple):
         return self.seconds / self.peer_training
 
 
-def time_to_reach(own: dict[str, list[Run]]) -> Reach:
+def times_to_reach(runs: Runs) -> dict[str, Reach]:
     """
-    :param own: runs of one task by algorithm
-    :return: times until the first evaluation at or above the target
+    :param runs: of all tasks
+    :return: times until the first evaluation at or above the target, of each task that :func:`on_one_processor` has
     """
-    target = float(interquartile_mean(scores_of(own[TRPO])))
-    ours = np.array([first_reach(run, target) for run in own[OURS]])
-    peer = np.array([first_reach(run, target) for run in own[TRPO]])
+    return {task: _time_to_reach(own, runs[task][TRPO]) for task, own in on_one_processor(runs).items()}
+
+
+def _time_to_reach(timed: dict[str, list[Run]], of_peer: list[Run]) -> Reach:
+    target = float(interquartile_mean(scores_of(of_peer)))
+    ours = np.array([first_reach(run, target) for run in timed[OURS]])
+    peer = np.array([first_reach(run, target) for run in timed[TRPO]])
     steps, seconds = (float(_median(ours[:, column])) for column in (0, 1))
-    is_learned = target > float(interquartile_mean(np.array([run.returns[0] for run in own[TRPO]])))
-    return Reach(target, steps, seconds, float(_median(peer[:, 1])), training_seconds(own[TRPO]), is_learned)
+    is_learned = target > float(interquartile_mean(np.array([run.returns[0] for run in of_peer])))
+    return Reach(target, steps, seconds, float(_median(peer[:, 1])), training_seconds(timed[TRPO]), is_learned)
 
 
 def fewest_runs(groups: Iterable[list[Run]]) -> int:

@@ -19,12 +19,14 @@ class Run(NamedTuple):
     :param seconds: of training until then, of the processor: one thread on a core of its own, so that nothing else on the
         machine counts
     :param returns: mean over the episodes
+    :param processor: that it ran on; seconds of one say nothing beside those of another
     """
 
     seed: int
     steps: np.ndarray
     seconds: np.ndarray
     returns: np.ndarray
+    processor: str
 
     @property
     def score(self) -> float:
@@ -45,10 +47,12 @@ def runs_of(table: pd.DataFrame, task: str, algorithm: str, steps: int, variant:
         return []
     wanted = (table["task"] == task) & (table["algorithm"] == algorithm) & (table["steps"] == steps)
     chosen = table[wanted & (table["variant"] == variant)]
-    return [
-        Run(int(seed), *(rows.sort_values("step")[name].to_numpy(float) for name in ("step", "cpu_seconds", "mean_return")))
-        for seed, rows in chosen.groupby("seed")
-    ]
+    return [_run(int(seed), rows.sort_values("step")) for seed, rows in chosen.groupby("seed")]
+
+
+def _run(seed: int, rows: pd.DataFrame) -> Run:
+    steps, seconds, returns = (rows[name].to_numpy(float) for name in ("step", "cpu_seconds", "mean_return"))
+    return Run(seed, steps, seconds, returns, rows["processor"].iloc[-1])
 
 
 def all_runs(table: pd.DataFrame, task: str, steps: int) -> dict[str, list[Run]]:

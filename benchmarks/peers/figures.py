@@ -10,7 +10,14 @@ from matplotlib.figure import Figure
 
 from benchmarks.peers.aggregates import curve_over_tasks, normalized
 from benchmarks.peers.algorithms import ALGORITHMS, TRPO
-from benchmarks.peers.comparison import Runs, common_algorithms, mujoco_runs, scores_after, training_seconds
+from benchmarks.peers.comparison import (
+    Runs,
+    common_algorithms,
+    mujoco_runs,
+    on_one_processor,
+    scores_after,
+    training_seconds,
+)
 from benchmarks.peers.curves import Run, against_seconds, against_steps, scores_of
 from benchmarks.peers.protocol import EVALUATIONS, MUJOCO_STEPS
 from sb3_gae.sweep.statistics import Estimate, estimate
@@ -21,15 +28,15 @@ _COLUMNS = 3
 def draw_all(table: pd.DataFrame) -> dict[str, Figure]:
     """
     :param table: of results
-    :return: figures by the name of their file; none where there are no results
+    :return: figures by the name of their file; none where there are no results whose times can be compared
     """
     runs = mujoco_runs(table)
-    if not runs:
+    if not (timed := on_one_processor(runs)):
         return {}
     return {
         "peers_steps": _tasks_figure(runs, lambda own: against_steps(own, MUJOCO_STEPS), 1e6, "million steps"),
-        "peers_seconds": _tasks_figure(runs, against_seconds, 60.0, "minutes of training"),
-        "peers_over_tasks": _over_tasks_figure(runs),
+        "peers_seconds": _tasks_figure(timed, against_seconds, 60.0, "minutes of training"),
+        "peers_over_tasks": _over_tasks_figure(runs, timed),
     }
 
 
@@ -49,7 +56,7 @@ def _tasks_figure(runs: Runs, curve: Callable[[list[Run]], tuple[np.ndarray, np.
     return figure
 
 
-def _over_tasks_figure(runs: Runs) -> Figure:
+def _over_tasks_figure(runs: Runs, timed: Runs) -> Figure:
     figure = Figure(figsize=(9.2, 3.9), layout="constrained")
     by_steps, by_seconds = figure.subplots(1, 2, sharey=True)
     fractions = np.linspace(0, 1, EVALUATIONS + 1)
@@ -58,10 +65,11 @@ def _over_tasks_figure(runs: Runs) -> Figure:
         curves = [against_steps(own[name], MUJOCO_STEPS)[1] for own in runs.values()]
         by_evaluation = [normalized([curve[:, place] for curve in curves], reference) for place in range(len(fractions))]
         _band(by_steps, name, fractions, curve_over_tasks(np.stack(by_evaluation, axis=-1)))
-        at_times = [scores_after(runs, fraction)[name] for fraction in fractions]
-        _band(by_seconds, name, fractions, curve_over_tasks(np.stack(at_times, axis=-1)))
+    at_times = [scores_after(runs, fraction) for fraction in fractions]
+    for name in common_algorithms(timed):
+        _band(by_seconds, name, fractions, curve_over_tasks(np.stack([scores[name] for scores in at_times], axis=-1)))
     by_steps.set_xlabel("million steps")
-    seconds = [training_seconds(own[TRPO]) for own in runs.values()]
+    seconds = [training_seconds(own[TRPO]) for own in timed.values()]
     by_seconds.set_xlabel(f"part of the time that sb3-contrib's TRPO takes ({min(seconds):.0f} to {max(seconds):.0f} s)")
     by_steps.set_ylabel("IQM over tasks, sb3-contrib's TRPO = 1")
     _legend(figure)

@@ -48,7 +48,7 @@ def sections_of(table: pd.DataFrame) -> dict[str, str]:
     :param table: of results
     :return: Markdown by the name of the section
     """
-    has_figures = bool(tables.scores_table(table))
+    has_figures = bool(tables.reach_table(table))
     drawn = {name: f"![{title}](images/{file}.svg)" * has_figures for name, (file, title) in _FIGURES.items()}
     made = {name: make(table) for name, make in _TABLES.items()}
     for name, preset in _PRESETS.items():
