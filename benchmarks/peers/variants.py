@@ -188,5 +188,16 @@ SWIMMER_CANDIDATES = {
     )
 }
 
+_WALKER2D = _STD_1 | {"target_kl": 0.03, "vf_cg_damping": "auto"}
+
+#: settings that were tried on Walker2d-v5, where it is chance, too, when an agent finds its gait
+WALKER2D_CANDIDATES = {
+    f"try-walker2d-{name}": Variant(title, _WALKER2D | overrides)
+    for name, title, overrides in (
+        ("auto", 'damping of the value fit "auto", 0.29 here', {}),
+        ("damping-3", "damping of the value fit 3", {"vf_cg_damping": 3.0}),
+    )
+}
+
 #: all of them, by name
-EVERY_VARIANT = VARIANTS | CANDIDATES | PENDULUM_CANDIDATES | SWIMMER_CANDIDATES
+EVERY_VARIANT = VARIANTS | CANDIDATES | PENDULUM_CANDIDATES | SWIMMER_CANDIDATES | WALKER2D_CANDIDATES
