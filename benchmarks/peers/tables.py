@@ -31,9 +31,17 @@ from benchmarks.peers.plan import (
     SWIMMER_TUNING_STEPS,
     TUNING_STEPS,
     TUNING_TASKS,
+    WALKER2D,
 )
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, PUBLISHED_PPO
-from benchmarks.peers.variants import CANDIDATES, PENDULUM_CANDIDATES, SWIMMER_CANDIDATES, VARIANTS, Variant
+from benchmarks.peers.variants import (
+    CANDIDATES,
+    PENDULUM_CANDIDATES,
+    SWIMMER_CANDIDATES,
+    VARIANTS,
+    WALKER2D_CANDIDATES,
+    Variant,
+)
 from sb3_gae.sweep.statistics import interquartile_mean
 
 #: parts of sb3-contrib TRPO's training time at which scores are compared
@@ -214,7 +222,18 @@ def swimmer_tuning_table(table: pd.DataFrame) -> str:
     :param table: of results
     :return: score of each run with the settings that were tried on Swimmer-v5, the worst first
     """
-    found = _tried_on(table, SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_STEPS)
+    return _run_by_run(_tried_on(table, SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_STEPS))
+
+
+def walker2d_tuning_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: the same on Walker2d-v5
+    """
+    return _run_by_run(_tried_on(table, WALKER2D, WALKER2D_CANDIDATES, MUJOCO_STEPS))
+
+
+def _run_by_run(found: dict[str, list[Run]]) -> str:
     rows = [[title, ", ".join(number(run) for run in sorted(scores_of(runs))), _score(runs)] for title, runs in found.items()]
     return markdown_table(["", "runs, the worst first", "together"], rows)
 
