@@ -6,7 +6,14 @@ from typing import NamedTuple
 from benchmarks.peers.algorithms import A2C, OURS, PPO, TIANSHOU_NPG, TIANSHOU_TRPO, TRPO
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, MUJOCO_TASKS, PUBLISHED_PPO
-from benchmarks.peers.variants import CANDIDATES, PENDULUM_CANDIDATES, SHIPPED, SWIMMER_CANDIDATES, VARIANTS, WALKER2D_CANDIDATES
+from benchmarks.peers.variants import (
+    CANDIDATES,
+    PENDULUM_CANDIDATES,
+    SHIPPED,
+    SWIMMER_CANDIDATES,
+    VARIANTS,
+    WALKER2D_CANDIDATES,
+)
 
 #: of ours and of the peers that the targets name
 SEEDS = 5
