@@ -23,7 +23,7 @@ VARIANTS = {
     SHIPPED: Variant("as shipped", {}),
     "one-value-step": Variant("one value step a batch, not up to five", {"vf_steps": 1}),
     "small-epsilon": Variant("ε = 0.01, not 0.2", {"vf_trust_region": 0.01}),
-    "weak-damping": Variant("damping of the value fit 0.01, not 600 over the samples", {"vf_cg_damping": 0.01}),
+    "weak-damping": Variant("damping of the value fit 0.01", {"vf_cg_damping": 0.01}),
     "monte-carlo": Variant("Monte-Carlo targets, not λ-returns", {"value_lambda": 1.0}),
     "adam": Variant(
         "the value function fitted by Adam, as sb3-contrib does",
