@@ -8,11 +8,11 @@ from benchmarks.peers.errors import PeersError
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, MUJOCO_TASKS, PUBLISHED_PPO
 from benchmarks.peers.variants import (
     CANDIDATES,
+    DAMPING_CANDIDATES,
     PENDULUM_CANDIDATES,
     SHIPPED,
     SWIMMER_CANDIDATES,
     VARIANTS,
-    WALKER2D_CANDIDATES,
 )
 
 #: of ours and of the peers that the targets name
@@ -35,9 +35,8 @@ SWIMMER = "Swimmer-v5"
 SWIMMER_TUNING_SEEDS = range(110, 118)
 #: by when it has been decided
 SWIMMER_TUNING_STEPS = 200_000
-WALKER2D = "Walker2d-v5"
-#: others than had given the idea
-WALKER2D_TUNING_SEEDS = range(110, 116)
+#: of the damping of the value fit, others than had given the idea
+DAMPING_TUNING_SEEDS = range(110, 116)
 
 
 class Cell(NamedTuple):
@@ -133,6 +132,10 @@ PRESETS: dict[str, tuple[Cell, ...]] = {
     "tuning-long": tuple(_tuning(MUJOCO_STEPS)),
     "tuning-pendulum": tuple(_tuning_of(PENDULUM, PENDULUM_CANDIDATES, PENDULUM_TUNING_SEEDS, CLASSIC_TASKS[PENDULUM])),
     "tuning-swimmer": tuple(_tuning_of(SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_SEEDS, SWIMMER_TUNING_STEPS)),
-    "tuning-walker2d": tuple(_tuning_of(WALKER2D, WALKER2D_CANDIDATES, WALKER2D_TUNING_SEEDS, MUJOCO_STEPS)),
+    "tuning-damping": tuple(
+        cell
+        for task, candidates in DAMPING_CANDIDATES.items()
+        for cell in _tuning_of(task, candidates, DAMPING_TUNING_SEEDS, MUJOCO_STEPS)
+    ),
     "smoke": tuple(_seed_major({"CartPole-v1": SMOKE_STEPS}, {OURS: 1, TRPO: 1})),
 }

@@ -29,7 +29,7 @@ _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "tuning long": tables.long_tuning_table,
     "tuning pendulum": tables.pendulum_tuning_table,
     "tuning swimmer": tables.swimmer_tuning_table,
-    "tuning walker2d": tables.walker2d_tuning_table,
+    "tuning damping": tables.damping_tuning_table,
     "origin": tables.origin_list,
 }
 #: sections that README has as well

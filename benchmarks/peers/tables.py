@@ -31,21 +31,21 @@ from benchmarks.peers.plan import (
     SWIMMER_TUNING_STEPS,
     TUNING_STEPS,
     TUNING_TASKS,
-    WALKER2D,
 )
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, PUBLISHED_PPO
 from benchmarks.peers.variants import (
     CANDIDATES,
+    DAMPING_CANDIDATES,
     PENDULUM_CANDIDATES,
     SWIMMER_CANDIDATES,
     VARIANTS,
-    WALKER2D_CANDIDATES,
     Variant,
 )
 from sb3_gae.sweep.statistics import interquartile_mean
 
 #: parts of sb3-contrib TRPO's training time at which scores are compared
 FRACTIONS = {"a fifth": 0.2, "half": 0.5, "all": 1.0}
+_RUN_BY_RUN = ["runs, the worst first", "together"]
 
 
 def scores_table(table: pd.DataFrame) -> str:
@@ -222,20 +222,24 @@ def swimmer_tuning_table(table: pd.DataFrame) -> str:
     :param table: of results
     :return: score of each run with the settings that were tried on Swimmer-v5, the worst first
     """
-    return _run_by_run(_tried_on(table, SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_STEPS))
+    found = _tried_on(table, SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_STEPS)
+    return markdown_table(["", *_RUN_BY_RUN], _run_by_run(found))
 
 
-def walker2d_tuning_table(table: pd.DataFrame) -> str:
+def damping_tuning_table(table: pd.DataFrame) -> str:
     """
     :param table: of results
-    :return: the same on Walker2d-v5
+    :return: the same with each damping of the value fit, task by task
     """
-    return _run_by_run(_tried_on(table, WALKER2D, WALKER2D_CANDIDATES, MUJOCO_STEPS))
+    rows = []
+    for task, candidates in DAMPING_CANDIDATES.items():
+        found = _tried_on(table, task, candidates, MUJOCO_STEPS)
+        rows += [[task, *row] for row in _run_by_run(found)]
+    return markdown_table(["task", "`vf_cg_damping`", *_RUN_BY_RUN], rows)
 
 
-def _run_by_run(found: dict[str, list[Run]]) -> str:
-    rows = [[title, ", ".join(number(run) for run in sorted(scores_of(runs))), _score(runs)] for title, runs in found.items()]
-    return markdown_table(["", "runs, the worst first", "together"], rows)
+def _run_by_run(found: dict[str, list[Run]]) -> list[list[str]]:
+    return [[title, ", ".join(number(run) for run in sorted(scores_of(runs))), _score(runs)] for title, runs in found.items()]
 
 
 def _tried_on(table: pd.DataFrame, task: str, candidates: dict[str, Variant], steps: int) -> dict[str, list[Run]]:

@@ -188,16 +188,31 @@ SWIMMER_CANDIDATES = {
     )
 }
 
-_WALKER2D = _STD_1 | {"target_kl": 0.03, "vf_cg_damping": "auto"}
+# What tasks had beside the damping of the value fit when that was tried
+_WHEN_DAMPED: dict[str, dict[str, Any]] = {
+    "HalfCheetah-v5": {"target_kl": 0.03, "policy_kwargs": "dict(log_std_init=-1)"},
+    "Hopper-v5": _STD_1 | {"target_kl": 0.01},
+    "Walker2d-v5": _STD_1 | {"target_kl": 0.03},
+    "Ant-v5": _STD_SMALLER | {"target_kl": 0.01, "gae_lambda": 0.9},
+    "Humanoid-v5": _MANY_JOINTS,
+}
 
-#: settings that were tried on Walker2d-v5, where it is chance, too, when an agent finds its gait
-WALKER2D_CANDIDATES = {
-    f"try-walker2d-{name}": Variant(title, _WALKER2D | overrides)
-    for name, title, overrides in (
-        ("auto", 'damping of the value fit "auto", 0.29 here', {}),
-        ("damping-3", "damping of the value fit 3", {"vf_cg_damping": 3.0}),
-    )
+#: dampings of the value fit that were tried, by task
+DAMPING_CANDIDATES = {
+    task: {
+        f"try-{task.removesuffix('-v5').lower()}-{name}": Variant(title, others | {"vf_cg_damping": damping})
+        for name, title, damping in (
+            ("damping-.01", "0.01", 0.01),
+            ("auto", '"auto", 0.29 here', "auto"),
+            ("damping-3", "3", 3.0),
+        )
+    }
+    for task, others in _WHEN_DAMPED.items()
 }
 
 #: all of them, by name
-EVERY_VARIANT = VARIANTS | CANDIDATES | PENDULUM_CANDIDATES | SWIMMER_CANDIDATES | WALKER2D_CANDIDATES
+EVERY_VARIANT = {
+    name: variant
+    for variants in (VARIANTS, CANDIDATES, PENDULUM_CANDIDATES, SWIMMER_CANDIDATES, *DAMPING_CANDIDATES.values())
+    for name, variant in variants.items()
+}
