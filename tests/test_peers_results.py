@@ -262,16 +262,17 @@ def test_export_keeps_runs_that_are_not_here(tmp_path: Path) -> None:
 def test_a_report_without_results_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(report, "read_results", lambda: read_results(tmp_path))
     with pytest.raises(PeersError, match="no results yet"):
-        report.write_report(tmp_path / "page.md", tmp_path, tmp_path / "README.md")
+        report.write_report(tmp_path)
 
 
 def test_a_report_is_a_page_and_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = pd.concat([a_run("Hopper-v5", name, seed, MUJOCO_STEPS) for name in (OURS, TRPO) for seed in (0, 1)])
     monkeypatch.setattr(report, "read_results", lambda: few)
-    page, readme = tmp_path / "page.md", tmp_path / "README.md"
-    page.write_text(report.PAGE.read_text())
-    readme.write_text(report.README.read_text())
-    written = report.write_report(page, tmp_path, readme)
-    assert "![Return against steps on each task](images/peers_steps.svg)" in page.read_text()
-    assert {path.name for path in written} >= {"page.md", "README.md", "peers_steps.svg"}
+    (tmp_path / "docs").mkdir()
+    for path in report.PAGES:
+        (tmp_path / path).write_text((report.ROOT / path).read_text())
+    written = report.write_report(tmp_path)
+    page = (tmp_path / "docs" / "benchmarks.md").read_text()
+    assert "![Return against steps on each task](images/peers_steps.svg)" in page
+    assert {path.name for path in written} >= {"benchmarks.md", "tuning.md", "README.md", "peers_steps.svg"}
     assert all(path.stat().st_size > 0 for path in written)

@@ -64,9 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     verbs.add_parser("status", parents=[plan], help="where the runs stand").set_defaults(command=_status)
     exported = verbs.add_parser("export", parents=[shared], help="gather what is done into the committed files")
     exported.set_defaults(command=_export)
-    verbs.add_parser("report", help="tables into docs/benchmarks.md and README.md, figures into docs/images").set_defaults(
-        command=_report
-    )
+    verbs.add_parser("report", help="tables into README.md and docs, figures into docs/images").set_defaults(command=_report)
     speeds = verbs.add_parser("measure", help="speeds, for the estimate of a dry run")
     speeds.add_argument("--tasks", nargs="+", default=[*CLASSIC_TASKS, *MUJOCO_TASKS])
     speeds.add_argument("--output", type=Path, default=SPEEDS)

@@ -1,4 +1,4 @@
-"""The results page and its figures, from the committed results and nothing else."""
+"""The pages of results and their figures, from the committed results and nothing else."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,10 +10,7 @@ from benchmarks.peers.errors import PeersError
 from benchmarks.peers.page import filled
 from benchmarks.peers.table import read_results
 
-README = Path(__file__).parents[2] / "README.md"
-DOCS = README.parent / "docs"
-PAGE = DOCS / "benchmarks.md"
-IMAGES = DOCS / "images"
+ROOT = Path(__file__).parents[2]
 
 _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "summary": tables.summary,
@@ -32,8 +29,6 @@ _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "tuning damping": tables.damping_tuning_table,
     "origin": tables.origin_list,
 }
-#: sections that README has as well
-OF_README = ("summary", "scores")
 #: preset that makes what a section needs, of those that would leave a chapter empty
 _PRESETS = {"classic": "classic", "three million": "mujoco-3m", "ablation": "ablation"}
 #: title of each figure, by the section of the page that it stands in
@@ -41,6 +36,15 @@ _FIGURES = {
     "figure steps": ("peers_steps", "Return against steps on each task"),
     "figure seconds": ("peers_seconds", "Return against seconds of training on each task"),
     "figure over tasks": ("peers_over_tasks", "Interquartile mean over tasks, against steps and against time"),
+}
+
+
+_OF_TUNING = [name for name in _TABLES if name.startswith("tuning")]
+#: sections of each page, by its path in the repository
+PAGES = {
+    "README.md": ["summary", "scores"],
+    "docs/benchmarks.md": [*(name for name in _TABLES if name not in _OF_TUNING), *_FIGURES],
+    "docs/tuning.md": _OF_TUNING,
 }
 
 
@@ -57,11 +61,9 @@ def sections_of(table: pd.DataFrame) -> dict[str, str]:
     return made | drawn
 
 
-def write_report(page: Path = PAGE, images: Path = IMAGES, readme: Path = README) -> list[Path]:
+def write_report(root: Path = ROOT) -> list[Path]:
     """
-    :param page: to be filled
-    :param images: folder of the figures
-    :param readme: to be filled with :data:`OF_README`
+    :param root: of the repository, where :data:`PAGES` are filled and figures drawn
     :return: paths of what was written
     :raises PeersError: if there are no results
     """
@@ -76,9 +78,12 @@ def write_report(page: Path = PAGE, images: Path = IMAGES, readme: Path = README
     from sb3_gae.sweep.figures.style import STYLE
 
     sections = sections_of(table)
-    page.write_text(filled(page.read_text(), sections))
-    readme.write_text(filled(readme.read_text(), {name: sections[name] for name in OF_README}))
-    written = [page, readme]
+    written = []
+    for path, names in PAGES.items():
+        page = root / path
+        page.write_text(filled(page.read_text(), {name: sections[name] for name in names}))
+        written.append(page)
+    images = root / "docs" / "images"
     images.mkdir(parents=True, exist_ok=True)
     with rc_context(STYLE):
         for name, figure in draw_all(table).items():

@@ -156,6 +156,7 @@ _PENDULUM = {"n_envs": 8, "n_steps": 128, "gamma": 0.9, "gae_lambda": 0.95, "tar
 # Two environments as the zoo has for trpo
 _SDE = {"use_sde": True, "sde_sample_freq": 4}
 _SDE_TWO_ENVS = _SDE | {"n_envs": 2, "n_steps": 1024}
+_SDE_1024 = _SDE | {"n_envs": 2, "n_steps": 512}
 
 #: settings that were tried on Pendulum-v1, where a run takes seconds
 PENDULUM_CANDIDATES = {
@@ -168,7 +169,12 @@ PENDULUM_CANDIDATES = {
         ("sde-batch-512", "gSDE, 8 × 64 steps", _SDE | {"n_steps": 64}),
         ("sde-two-envs", "gSDE, 2 × 1 024 steps", _SDE_TWO_ENVS),
         ("sde-two-envs-kl-.03", "gSDE, 2 × 1 024 steps, KL 0.03", _SDE_TWO_ENVS | {"target_kl": 0.03}),
-        ("sde-two-envs-1024", "gSDE, 2 × 512 steps", _SDE | {"n_envs": 2, "n_steps": 512}),
+        ("sde-two-envs-1024", "gSDE, 2 × 512 steps", _SDE_1024),
+        ("sde-two-envs-1024-kl-.005", "… KL 0.005", _SDE_1024 | {"target_kl": 0.005}),
+        ("sde-two-envs-1024-damping-1", "… damping of the policy step 1", _SDE_1024 | {"cg_damping": 1.0}),
+        ("sde-two-envs-1024-value-damping-.01", "… damping of the value fit 0.01", _SDE_1024 | {"vf_cg_damping": 0.01}),
+        ("sde-two-envs-1024-value-damping-3", "… damping of the value fit 3", _SDE_1024 | {"vf_cg_damping": 3.0}),
+        ("sde-two-envs-1024-lambda-.98", "… λ 0.98", _SDE_1024 | {"gae_lambda": 0.98}),
         ("sde-lambda-.9", "gSDE, λ 0.9", _SDE | {"gae_lambda": 0.9}),
         ("sde-lambda-.99", "gSDE, λ 0.99", _SDE | {"gae_lambda": 0.99}),
     )
