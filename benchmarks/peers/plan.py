@@ -9,6 +9,7 @@ from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, M
 from benchmarks.peers.variants import (
     CANDIDATES,
     DAMPING_CANDIDATES,
+    HUMANOID_CANDIDATES,
     PENDULUM_CANDIDATES,
     SHIPPED,
     SWIMMER_CANDIDATES,
@@ -35,6 +36,8 @@ SWIMMER = "Swimmer-v5"
 SWIMMER_TUNING_SEEDS = range(110, 118)
 #: by when it has been decided
 SWIMMER_TUNING_STEPS = 200_000
+HUMANOID = "Humanoid-v5"
+HUMANOID_TUNING_SEEDS = range(110, 113)
 #: of the damping of the value fit, others than had given the idea
 DAMPING_TUNING_SEEDS = range(110, 116)
 
@@ -132,6 +135,7 @@ PRESETS: dict[str, tuple[Cell, ...]] = {
     "tuning-long": tuple(_tuning(MUJOCO_STEPS)),
     "tuning-pendulum": tuple(_tuning_of(PENDULUM, PENDULUM_CANDIDATES, PENDULUM_TUNING_SEEDS, CLASSIC_TASKS[PENDULUM])),
     "tuning-swimmer": tuple(_tuning_of(SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_SEEDS, SWIMMER_TUNING_STEPS)),
+    "tuning-humanoid": tuple(_tuning_of(HUMANOID, HUMANOID_CANDIDATES, HUMANOID_TUNING_SEEDS, MUJOCO_STEPS)),
     "tuning-damping": tuple(
         cell
         for task, candidates in DAMPING_CANDIDATES.items()

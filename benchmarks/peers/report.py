@@ -26,6 +26,7 @@ _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "tuning long": tables.long_tuning_table,
     "tuning pendulum": tables.pendulum_tuning_table,
     "tuning swimmer": tables.swimmer_tuning_table,
+    "tuning humanoid": tables.humanoid_tuning_table,
     "tuning damping": tables.damping_tuning_table,
     "origin": tables.origin_list,
 }

@@ -25,6 +25,7 @@ from benchmarks.peers.plan import (
     ABLATION_TASKS,
     CLASSIC_SEEDS,
     FEW_SEEDS,
+    HUMANOID,
     PENDULUM,
     SEEDS,
     SWIMMER,
@@ -36,6 +37,7 @@ from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, P
 from benchmarks.peers.variants import (
     CANDIDATES,
     DAMPING_CANDIDATES,
+    HUMANOID_CANDIDATES,
     PENDULUM_CANDIDATES,
     SWIMMER_CANDIDATES,
     VARIANTS,
@@ -223,6 +225,15 @@ def swimmer_tuning_table(table: pd.DataFrame) -> str:
     :return: score of each run with the settings that were tried on Swimmer-v5, the worst first
     """
     found = _tried_on(table, SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_STEPS)
+    return markdown_table(["", *_RUN_BY_RUN], _run_by_run(found))
+
+
+def humanoid_tuning_table(table: pd.DataFrame) -> str:
+    """
+    :param table: of results
+    :return: the same on Humanoid-v5
+    """
+    found = _tried_on(table, HUMANOID, HUMANOID_CANDIDATES, MUJOCO_STEPS)
     return markdown_table(["", *_RUN_BY_RUN], _run_by_run(found))
 
 

@@ -216,9 +216,30 @@ DAMPING_CANDIDATES = {
     for task, others in _WHEN_DAMPED.items()
 }
 
+_HUMANOID = _MANY_JOINTS | {"cg_damping": 0.1, "vf_cg_damping": "auto"}
+
+#: settings that were tried on Humanoid-v5, where steps of the policy gain little
+HUMANOID_CANDIDATES = {
+    f"try-humanoid-{name}": Variant(title, _HUMANOID | overrides)
+    for name, title, overrides in (
+        ("kl-.03", "KL 0.03", {}),
+        ("kl-.06", "KL 0.06", {"target_kl": 0.06}),
+        ("kl-.1", "KL 0.1", {"target_kl": 0.1}),
+        ("policy-damping-10", "KL 0.03, damping of the policy step 10", {"cg_damping": 10.0}),
+        ("kl-.06-value-damping-3", "KL 0.06, damping of the value fit 3", {"target_kl": 0.06, "vf_cg_damping": 3.0}),
+    )
+}
+
 #: all of them, by name
 EVERY_VARIANT = {
     name: variant
-    for variants in (VARIANTS, CANDIDATES, PENDULUM_CANDIDATES, SWIMMER_CANDIDATES, *DAMPING_CANDIDATES.values())
+    for variants in (
+        VARIANTS,
+        CANDIDATES,
+        PENDULUM_CANDIDATES,
+        SWIMMER_CANDIDATES,
+        HUMANOID_CANDIDATES,
+        *DAMPING_CANDIDATES.values(),
+    )
     for name, variant in variants.items()
 }
