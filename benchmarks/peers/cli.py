@@ -14,7 +14,7 @@ from benchmarks.peers.pool import Options, Pool, check_libraries
 from benchmarks.peers.progress import Bar, left_of, standings, summary
 from benchmarks.peers.protocol import CLASSIC_TASKS, MUJOCO_TASKS
 
-#: all that the results page has
+#: all that the page of results has
 DEFAULT_PRESETS = ("classic", "mujoco", "mujoco-3m", "ablation")
 
 #: of the environment that `make bench-full` makes

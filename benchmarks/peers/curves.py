@@ -40,7 +40,7 @@ def runs_of(table: pd.DataFrame, task: str, algorithm: str, steps: int, variant:
     :param task: id of the environment
     :param algorithm: key of :data:`~benchmarks.peers.algorithms.ALGORITHMS`
     :param steps: of the trainings
-    :param variant: key of :data:`~benchmarks.peers.variants.VARIANTS`
+    :param variant: key of :data:`~benchmarks.peers.variants.EVERY_VARIANT`
     :return: in the order of their seeds
     """
     if table.empty:

@@ -1,4 +1,4 @@
-"""The results page: text by hand, and between markers what comes from the results."""
+"""Pages of results: text by hand, and between markers what comes from the results."""
 
 import re
 from collections.abc import Mapping, Sequence

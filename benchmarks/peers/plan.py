@@ -118,6 +118,12 @@ def _tuning_of(task: str, candidates: Iterable[str], seeds: Iterable[int], steps
             yield Cell(task, OURS, variant, seed, steps)
 
 
+def _tuning_of_dampings() -> Iterator[Cell]:
+    for seed in DAMPING_TUNING_SEEDS:
+        for task, candidates in DAMPING_CANDIDATES.items():
+            yield from _tuning_of(task, candidates, [seed], MUJOCO_STEPS)
+
+
 def _mujoco() -> Iterator[Cell]:
     tasks = dict.fromkeys(MUJOCO_TASKS, MUJOCO_STEPS)
     first = {OURS: SEEDS, TRPO: SEEDS, PPO: SEEDS}
@@ -136,10 +142,6 @@ PRESETS: dict[str, tuple[Cell, ...]] = {
     "tuning-pendulum": tuple(_tuning_of(PENDULUM, PENDULUM_CANDIDATES, PENDULUM_TUNING_SEEDS, CLASSIC_TASKS[PENDULUM])),
     "tuning-swimmer": tuple(_tuning_of(SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_SEEDS, SWIMMER_TUNING_STEPS)),
     "tuning-humanoid": tuple(_tuning_of(HUMANOID, HUMANOID_CANDIDATES, HUMANOID_TUNING_SEEDS, MUJOCO_STEPS)),
-    "tuning-damping": tuple(
-        cell
-        for task, candidates in DAMPING_CANDIDATES.items()
-        for cell in _tuning_of(task, candidates, DAMPING_TUNING_SEEDS, MUJOCO_STEPS)
-    ),
+    "tuning-damping": tuple(_tuning_of_dampings()),
     "smoke": tuple(_seed_major({"CartPole-v1": SMOKE_STEPS}, {OURS: 1, TRPO: 1})),
 }

@@ -8,6 +8,7 @@ import pandas as pd
 from benchmarks.peers import tables
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.page import filled
+from benchmarks.peers.shipped import shipped_table
 from benchmarks.peers.table import read_results
 
 ROOT = Path(__file__).parents[2]
@@ -30,8 +31,13 @@ _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "tuning damping": tables.damping_tuning_table,
     "origin": tables.origin_list,
 }
-#: preset that makes what a section needs, of those that would leave a chapter empty
-_PRESETS = {"classic": "classic", "three million": "mujoco-3m", "ablation": "ablation"}
+#: preset that makes what a section needs, of those that would leave a chapter empty without
+_PRESETS = {
+    "classic": "classic",
+    "three million": "mujoco-3m",
+    "ablation": "ablation",
+    **{name: name.replace(" ", "-") for name in _TABLES if name.startswith("tuning")},
+}
 #: title of each figure, by the section of the page that it stands in
 _FIGURES = {
     "figure steps": ("peers_steps", "Return against steps on each task"),
@@ -45,7 +51,7 @@ _OF_TUNING = [name for name in _TABLES if name.startswith("tuning")]
 PAGES = {
     "README.md": ["summary", "scores"],
     "docs/benchmarks.md": [*(name for name in _TABLES if name not in _OF_TUNING), *_FIGURES],
-    "docs/tuning.md": _OF_TUNING,
+    "docs/tuning.md": ["shipped", *_OF_TUNING],
 }
 
 
@@ -56,7 +62,7 @@ def sections_of(table: pd.DataFrame) -> dict[str, str]:
     """
     has_figures = bool(tables.reach_table(table))
     drawn = {name: f"![{title}](images/{file}.svg)" * has_figures for name, (file, title) in _FIGURES.items()}
-    made = {name: make(table) for name, make in _TABLES.items()}
+    made = {name: make(table) for name, make in _TABLES.items()} | {"shipped": shipped_table()}
     for name, preset in _PRESETS.items():
         made[name] = made[name] or f"Not run yet: `python -m benchmarks.peers run --preset {preset} --jobs 2`."
     return made | drawn

@@ -1,4 +1,4 @@
-"""Markdown of the results page."""
+"""Markdown of the pages of results."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -47,7 +47,6 @@ from sb3_gae.sweep.statistics import interquartile_mean
 
 #: parts of sb3-contrib TRPO's training time at which scores are compared
 FRACTIONS = {"a fifth": 0.2, "half": 0.5, "all": 1.0}
-_RUN_BY_RUN = ["runs, the worst first", "together"]
 
 
 def scores_table(table: pd.DataFrame) -> str:
@@ -183,7 +182,7 @@ def long_table(table: pd.DataFrame) -> str:
 def ablation_table(table: pd.DataFrame) -> str:
     """
     :param table: of results
-    :return: score with each choice undone, beside the shipped settings with the same seeds
+    :return: score with each choice undone, beside the shipped settings
     """
     shipped = {task: runs_of(table, task, OURS, MUJOCO_STEPS) for task in ABLATION_TASKS}
     rows = []
@@ -224,8 +223,7 @@ def swimmer_tuning_table(table: pd.DataFrame) -> str:
     :param table: of results
     :return: score of each run with the settings that were tried on Swimmer-v5, the worst first
     """
-    found = _tried_on(table, SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_STEPS)
-    return markdown_table(["", *_RUN_BY_RUN], _run_by_run(found))
+    return _run_by_run([""], {(): _tried_on(table, SWIMMER, SWIMMER_CANDIDATES, SWIMMER_TUNING_STEPS)})
 
 
 def humanoid_tuning_table(table: pd.DataFrame) -> str:
@@ -233,8 +231,7 @@ def humanoid_tuning_table(table: pd.DataFrame) -> str:
     :param table: of results
     :return: the same on Humanoid-v5
     """
-    found = _tried_on(table, HUMANOID, HUMANOID_CANDIDATES, MUJOCO_STEPS)
-    return markdown_table(["", *_RUN_BY_RUN], _run_by_run(found))
+    return _run_by_run([""], {(): _tried_on(table, HUMANOID, HUMANOID_CANDIDATES, MUJOCO_STEPS)})
 
 
 def damping_tuning_table(table: pd.DataFrame) -> str:
@@ -242,15 +239,20 @@ def damping_tuning_table(table: pd.DataFrame) -> str:
     :param table: of results
     :return: the same with each damping of the value fit, task by task
     """
-    rows = []
-    for task, candidates in DAMPING_CANDIDATES.items():
-        found = _tried_on(table, task, candidates, MUJOCO_STEPS)
-        rows += [[task, *row] for row in _run_by_run(found)]
-    return markdown_table(["task", "`vf_cg_damping`", *_RUN_BY_RUN], rows)
+    found: dict[tuple[str, ...], dict[str, list[Run]]] = {
+        (task,): _tried_on(table, task, candidates, MUJOCO_STEPS) for task, candidates in DAMPING_CANDIDATES.items()
+    }
+    return _run_by_run(["task", "`vf_cg_damping`"], found)
 
 
-def _run_by_run(found: dict[str, list[Run]]) -> list[list[str]]:
-    return [[title, ", ".join(number(run) for run in sorted(scores_of(runs))), _score(runs)] for title, runs in found.items()]
+def _run_by_run(heads: list[str], found: Mapping[tuple[str, ...], dict[str, list[Run]]]) -> str:
+    """A row for each settings, by the cells that begin it and its title."""
+    rows = [
+        [*first, title, ", ".join(number(run) for run in sorted(scores_of(runs))), _score(runs)]
+        for first, by_title in found.items()
+        for title, runs in by_title.items()
+    ]
+    return markdown_table([*heads, "runs, the worst first", "together"], rows)
 
 
 def _tried_on(table: pd.DataFrame, task: str, candidates: dict[str, Variant], steps: int) -> dict[str, list[Run]]:
@@ -324,8 +326,9 @@ def _mujoco_targets(runs: Runs) -> Iterable[list[str]]:
 def origin_list(table: pd.DataFrame) -> str:
     """
     :param table: of results
-    :return: versions and machines that the results are from
+    :return: versions and machines that the results are from, those of tuning left out
     """
+    table = table[table["variant"].isin(list(VARIANTS))] if len(table) else table
     if table.empty:
         return ""
     names = {"processor": "processor", "cores": "cores", "cores_of_run": "cores of a run", "python": "Python"}
