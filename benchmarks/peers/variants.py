@@ -206,6 +206,11 @@ SWIMMER_CANDIDATES = {
         ("lambda-.98", "λ 0.98, damping of the policy step 0.1", {}),
         ("damping-1", "λ 0.98, damping of the policy step 1", {"cg_damping": 1.0}),
         ("damping-3", "λ 0.98, damping of the policy step 3", {"cg_damping": 3.0}),
+        (
+            "damping-3-value-damping-3",
+            "λ 0.98, damping of the policy step and of the value fit 3",
+            {"cg_damping": 3.0, "vf_cg_damping": 3.0},
+        ),
     )
 }
 
