@@ -249,6 +249,7 @@ HUMANOID_CANDIDATES = {
         ("kl-.1", "KL 0.1", {"target_kl": 0.1}),
         ("policy-damping-10", "KL 0.03, damping of the policy step 10", {"cg_damping": 10.0}),
         ("kl-.06-value-damping-3", "KL 0.06, damping of the value fit 3", {"target_kl": 0.06, "vf_cg_damping": 3.0}),
+        ("kl-.1-value-damping-3", "KL 0.1, damping of the value fit 3", {"target_kl": 0.1, "vf_cg_damping": 3.0}),
         ("kl-.06-value-damping-10", "KL 0.06, damping of the value fit 10", {"target_kl": 0.06, "vf_cg_damping": 10.0}),
     )
 }
