@@ -13,11 +13,11 @@ from benchmarks.peers.variants import SHIPPED
 from sb3_gae import TRPOGAE
 
 _COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
-    "environments × steps": lambda settings: f"{settings['n_envs']} × {settings['n_steps']:,}".replace(",", " "),
-    "`gamma`": lambda settings: f"{settings['gamma']}",
-    "`gae_lambda`": lambda settings: f"{settings['gae_lambda']}",
-    "`target_kl`": lambda settings: f"{settings['target_kl']}",
-    "`log_std_init`": lambda settings: f"{_policy_kwargs(settings).get('log_std_init', 0)}",
+    "batch": lambda settings: f"{settings['n_envs']} × {settings['n_steps']:,}".replace(",", " "),
+    "γ": lambda settings: f"{settings['gamma']}",
+    "λ": lambda settings: f"{settings['gae_lambda']}",
+    "KL": lambda settings: f"{settings['target_kl']}",
+    "ln std": lambda settings: f"{_policy_kwargs(settings).get('log_std_init', 0)}",
     "`cg_damping`": lambda settings: f"{settings['cg_damping']:g}",
     "`vf_cg_damping`": lambda settings: f"{settings['vf_cg_damping']}".removesuffix(".0"),
 }
