@@ -251,6 +251,21 @@ HUMANOID_CANDIDATES = {
         ("kl-.06-value-damping-3", "KL 0.06, damping of the value fit 3", {"target_kl": 0.06, "vf_cg_damping": 3.0}),
         ("kl-.1-value-damping-3", "KL 0.1, damping of the value fit 3", {"target_kl": 0.1, "vf_cg_damping": 3.0}),
         ("kl-.06-value-damping-10", "KL 0.06, damping of the value fit 10", {"target_kl": 0.06, "vf_cg_damping": 10.0}),
+        (
+            "both-dampings",
+            "KL 0.03, damping of the policy step 10, of the value fit 3",
+            {"cg_damping": 10.0, "vf_cg_damping": 3.0},
+        ),
+        (
+            "kl-.06-both-dampings",
+            "KL 0.06, damping of the policy step 10, of the value fit 3",
+            {"target_kl": 0.06, "cg_damping": 10.0, "vf_cg_damping": 3.0},
+        ),
+        (
+            "kl-.06-policy-damping-100-value-damping-3",
+            "KL 0.06, damping of the policy step 100, of the value fit 3",
+            {"target_kl": 0.06, "cg_damping": 100.0, "vf_cg_damping": 3.0},
+        ),
     )
 }
 

@@ -69,10 +69,11 @@ def _sizes(plan: Plan) -> Iterator[_Size]:
     both = ("rollout", "iteration")
     for n_steps in plan.biped_steps:
         yield _Size(BIPED, "batch", plan.biped_envs, n_steps, PEER_ENVS, both)
-    for n_envs in plan.n_envs:
-        yield _Size(BIPED, "environments", n_envs, plan.width_batch // n_envs, n_envs, ("rollout",))
     for n_steps in plan.cheetah_steps if CHEETAH in tasks() else ():
         yield _Size(CHEETAH, "batch", CHEETAH_ENVS, n_steps, CHEETAH_ENVS, both)
+    for task in tasks():
+        for n_envs in plan.n_envs:
+            yield _Size(task, "environments", n_envs, plan.width_batch // n_envs, n_envs, ("rollout",))
 
 
 def _contenders(part: str, work: Callable[[Learner], None], size: _Size, threads: int) -> Iterator[Case]:
