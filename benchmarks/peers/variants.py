@@ -222,17 +222,21 @@ _WHEN_DAMPED: dict[str, dict[str, Any]] = {
     "Ant-v5": _STD_SMALLER | {"target_kl": 0.01, "gae_lambda": 0.9},
 }
 
+_DAMPINGS: dict[str, tuple[str, dict[str, Any]]] = {
+    "damping-.01": ("0.01", {"vf_cg_damping": 0.01}),
+    "auto": ('"auto", 0.29 here', {"vf_cg_damping": "auto"}),
+    "damping-3": ("3", {"vf_cg_damping": 3.0}),
+}
+_DAMPINGS_OF_ANT = _DAMPINGS | {
+    "policy-damping-10": ('"auto", and 10 for the policy step', {"vf_cg_damping": "auto", "cg_damping": 10.0}),
+    "policy-damping-100": ('"auto", and 100 for the policy step', {"vf_cg_damping": "auto", "cg_damping": 100.0}),
+}
+
 #: dampings of the value fit that were tried, by task
 DAMPING_CANDIDATES = {
     task: {
-        f"try-{task.removesuffix('-v5').lower()}-{name}": Variant(
-            title, others | {"cg_damping": 0.1, "vf_cg_damping": damping}
-        )
-        for name, title, damping in (
-            ("damping-.01", "0.01", 0.01),
-            ("auto", '"auto", 0.29 here', "auto"),
-            ("damping-3", "3", 3.0),
-        )
+        f"try-{task.removesuffix('-v5').lower()}-{name}": Variant(title, others | {"cg_damping": 0.1} | damping)
+        for name, (title, damping) in (_DAMPINGS_OF_ANT if task == "Ant-v5" else _DAMPINGS).items()
     }
     for task, others in _WHEN_DAMPED.items()
 }
