@@ -15,12 +15,16 @@ from sb3_gae.estimators.measures import ValueErrors, value_errors
 from sb3_gae.presets import PAPER_LAMBDAS
 from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer, LambdaSweep
 
+# Of SB3's 36 characters three are the indent below the group's name
+_LONGEST_KEY_OF_A_TABLE = 33
+
 
 class LambdaSweepCallback(BaseCallback):
     r"""
     Logs, after each rollout, what other :math:`\lambda` would have made of it. Needs no further samples.
 
-    Keys are ``sweep/<quantity>/lambda_<value>``, the quantities those of :class:`~sb3_gae.LambdaSweep`.
+    Keys are ``sweep/<quantity>/lambda_<value>``, the quantities those of :class:`~sb3_gae.LambdaSweep`. Those too long for
+    SB3's table are in the other logs alone.
     The summary of the last rollout is in ``self.sweep``.
 
     :param lambdas: weights of longer estimates, each in [0, 1]
@@ -51,8 +55,8 @@ class GradientDiagnosticsCallback(BaseCallback):
     Estimated from the rollout itself, see :func:`~sb3_gae.diagnostics.rollout_diagnostics.lambda_errors`, with the policy that
     collected it. A single rollout says little; average the curves over several. A rollout of a single trajectory is left out.
 
-    Keys are ``gradient/<quantity>/lambda_<value>``, the quantities those of :class:`~sb3_gae.LambdaErrors`.
-    The estimates of the last rollout that had any are in ``self.errors``. Beside them, to compare: ``value_error/<measure>``
+    Keys are ``gradient/<quantity>/lambda_<value>``, the quantities those of :class:`~sb3_gae.LambdaErrors`,
+    too long ones not in SB3's table. The estimates of the last rollout that had any are in ``self.errors``. Beside them, to compare: ``value_error/<measure>``
     with the measures of :class:`~sb3_gae.estimators.measures.ValueErrors`, which are in ``self.value_errors``, and
     ``value_error/policy_gradient``, the bias squared at :math:`\lambda = 0`
     (:func:`~sb3_gae.diagnostics.rollout_diagnostics.policy_gradient_value_error`).
@@ -174,10 +178,16 @@ def _value_errors(rollout_buffer: GAERolloutBuffer, gamma: float | None) -> Valu
 
 
 def _log(callback: BaseCallback, group: str, curves: Any, lambdas: Sequence[float]) -> None:
+    labels = [f"{gae_lambda:g}" for gae_lambda in lambdas]
+    if len(set(labels)) < len(labels):
+        labels = [repr(float(gae_lambda)) for gae_lambda in lambdas]
     for quantity, values in curves._asdict().items():
         if quantity != "gae_lambda":
-            for gae_lambda, value in zip(lambdas, values, strict=True):
-                callback.logger.record(f"{group}/{quantity}/lambda_{gae_lambda:g}", float(value))
+            for label, value in zip(labels, values, strict=True):
+                key = f"{quantity}/lambda_{label}"
+                # SB3's table cuts longer keys, and ends training where two of them are then the same
+                too_long = len(key) > _LONGEST_KEY_OF_A_TABLE
+                callback.logger.record(f"{group}/{key}", float(value), exclude="stdout" if too_long else None)
 
 
 @contextmanager

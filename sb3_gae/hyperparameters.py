@@ -90,7 +90,6 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
             "`value_fit_first`, and give `gae_lambda` a number or nothing."
         )
     _check_vf_kl_fraction(values)
-    _check_batch(values["n_steps"], values["n_envs"], values["sub_sampling_factor"], values["n_episodes"])
     _check_buffer_class(values["rollout_buffer_class"])
     if "value_lambda" in values["rollout_buffer_kwargs"]:
         raise ValueError("Pass `value_lambda` to TRPOGAE itself and not in `rollout_buffer_kwargs`.")
@@ -107,7 +106,14 @@ def _check_vf_kl_fraction(values: Mapping[str, Any]) -> None:
             )
 
 
-def _check_batch(n_steps: int, n_envs: int, sub_sampling_factor: int, n_episodes: int | None) -> None:
+def check_batch(n_steps: int, n_envs: int, sub_sampling_factor: int, n_episodes: int | None) -> None:
+    """
+    :param n_steps: of each environment
+    :param n_envs: number of environments
+    :param sub_sampling_factor: one of so many samples is in the batch of the policy
+    :param n_episodes: of each environment; None for batches of ``n_steps`` steps
+    :raises ValueError: if there is too little in a batch to learn from
+    """
     if n_episodes is not None and n_episodes * n_envs < 2:
         raise ValueError("A batch needs at least 2 episodes, but `n_episodes` = 1 in one environment gives 1; raise it.")
     n_samples = n_steps * n_envs // sub_sampling_factor

@@ -25,6 +25,7 @@ from sb3_gae.rollout.collection import (
     RolloutPlan,
     Step,
     TerminalObservation,
+    reported_episodes,
     take_steps,
     terminal_observations,
 )
@@ -119,6 +120,9 @@ class GAEOnPolicyAlgorithm(OnPolicyAlgorithm):
         assert self._last_obs is not None and self._last_episode_starts is not None, "No previous observation was provided"
         # First, so that a callback finds everything as the last iteration left it
         callback.on_rollout_start()
+        if self._total_timesteps > 0:
+            # SB3 does so only after a rollout, and a second `learn` would begin where the first has ended
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
         quota = EpisodeQuota(env.num_envs, self.n_episodes)
         if self.n_episodes is not None and not self._last_episode_starts.all():
             self._last_obs, self._last_episode_starts = cast(Observations, env.reset()), np.ones(env.num_envs, dtype=bool)
@@ -164,6 +168,8 @@ class GAEOnPolicyAlgorithm(OnPolicyAlgorithm):
 
             counts = quota.counts
             truncated = np.zeros(env.num_envs, dtype=bool)
+            if (reported := reported_episodes(dones, infos, counts)).size:
+                self._update_info_buffer([infos[env] for env in reported.tolist()], dones[reported])
             if dones.any():
                 endings = self._record_endings(n_steps, dones, dones if counts is None else dones & counts, infos)
                 terminal.extend(endings)
@@ -188,9 +194,7 @@ class GAEOnPolicyAlgorithm(OnPolicyAlgorithm):
     def _record_endings(
         self, step: int, dones: np.ndarray, counted: np.ndarray, infos: list[dict[str, Any]]
     ) -> list[TerminalObservation]:
-        """Log the episodes of the batch that ended in a step, and return those that a time limit ended."""
-        ended = [infos[env] for env in np.flatnonzero(counted)]
-        self._update_info_buffer(ended, np.ones(len(ended), dtype=bool))
+        """Log what else is said of ends, and return the episodes of the batch that a time limit ended."""
         self._numerical_failures += sum(bool(infos[env].get("numerical_failure")) for env in np.flatnonzero(dones))
         if self._numerical_failures:
             self.logger.record("rollout/numerical_failures", self._numerical_failures)
@@ -238,8 +242,17 @@ class GAEOnPolicyAlgorithm(OnPolicyAlgorithm):
         return [*super()._excluded_save_params(), "_rollout_end"]
 
     @classmethod
-    def load(cls, path: str | pathlib.Path | io.BufferedIOBase, env: GymEnv | None = None, *args: Any, **kwargs: Any) -> Self:
-        if "gae_lambda" in kwargs or "gae_lambda" in (kwargs.get("custom_objects") or {}):
+    def load(
+        cls,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        if "gae_lambda" in kwargs or "gae_lambda" in (custom_objects or {}):
             # A rule that was saved would overrule it
             kwargs["_lambda_rule"] = None
-        return super().load(path, env, *args, **kwargs)
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)

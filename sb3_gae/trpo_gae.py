@@ -9,7 +9,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_gae.batch import TrainingBatch, random_subset, standardized
-from sb3_gae.hyperparameters import check_hyperparameters, warn_of_unused
+from sb3_gae.hyperparameters import check_batch, check_hyperparameters, warn_of_unused
 from sb3_gae.lambda_rules import LambdaRule
 from sb3_gae.networks.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
 from sb3_gae.on_policy_algorithm import GAEOnPolicyAlgorithm
@@ -203,6 +203,7 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
         self.value_fit_first = value_fit_first
         if _init_setup_model:
             self._setup_model()
+            self._check_batch()
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -211,6 +212,10 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
 
     def _check_arguments(self) -> None:
         check_hyperparameters(vars(self))
+
+    def _check_batch(self) -> None:
+        # Not where a model is loaded: whoever only watches it may do so in a single environment
+        check_batch(self.n_steps, self.n_envs, self.sub_sampling_factor, self.n_episodes)
 
     def _maybe_recommend_cpu(self, mlp_class_name: str = "MlpPolicy") -> None:
         # SB3's own default is the name of its class, which no policy of ours has
@@ -323,8 +328,9 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
         :return: this model
         :raises NumericalError: if a number that must be finite is not, or the linear algebra breaks down; policy and optimiser
             are then as they were after the last update
-        :raises ValueError: if a schedule or rule of ``gae_lambda`` leaves [0, 1], or the action distribution depends on no
-            trainable parameter
+        :raises ValueError: if a schedule or rule of ``gae_lambda`` leaves [0, 1], the action distribution depends on no
+            trainable parameter, or the environments are too few for a batch
         :raises WorkersLostError: if workers are gone and cannot be replaced; the message says how to go on
         """
+        self._check_batch()
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

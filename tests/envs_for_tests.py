@@ -66,6 +66,16 @@ class AnySpacesEnv(gym.Env):
         return self.reward_scale * (float(np.mean(action)) + 0.1 * float(self.np_random.normal()))
 
 
+class Endless(gym.Wrapper):
+    """Outside `Monitor`: goes on after an end without a word of it."""
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if terminated or truncated:
+            observation, _ = self.env.reset()
+        return observation, float(reward), False, False, info
+
+
 class SlowEnv(AnySpacesEnv):
     """Gives a test the time to kill its process in the middle of a share."""
 

@@ -54,3 +54,16 @@ def test_bad_factors_are_refused_before_a_rollout(callback: Any, bad: dict[str, 
 def test_says_which_buffer_it_needs() -> None:
     with pytest.raises(TypeError, match=r"GAERolloutBuffer, got RolloutBuffer"):
         PPO("MlpPolicy", gym.make("CartPole-v1"), n_steps=64, device="cpu").learn(64, LambdaSweepCallback(LAMBDAS))
+
+
+@pytest.mark.parametrize("kind", [LambdaSweepCallback, GradientDiagnosticsCallback])
+@pytest.mark.parametrize("lambdas", [[1 - 2.0**-k for k in range(1, 9)], [0.9999991, 0.9999992]])
+def test_many_digits_do_not_end_training(kind: Any, lambdas: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+    """SB3's table would cut the keys to the same and refuse them."""
+    callback, record = kind(lambdas), Record()
+    env = make_vec_env("CartPole-v1", 2, seed=0)
+    model = TRPOGAE("MlpPolicy", env, n_steps=64, seed=0, device="cpu", verbose=1)
+    model.learn(128, callback=[callback, record])
+    assert "iterations" in capsys.readouterr().out
+    quantities = {key.rpartition("/")[0] for key in record.logged if "/lambda_" in key}
+    assert len([key for key in record.logged if "/lambda_" in key]) == len(quantities) * len(lambdas)

@@ -325,12 +325,32 @@ def test_numbers_that_blow_up_cut_the_episode(n_steps: int, monkeypatch: pytest.
 
 # Choice and refusals
 
+
+def changed(change: Callable[[Any], None]) -> gym.Env:
+    env = Monitor(gym.make("HalfCheetah-v5"))
+    change(env.unwrapped)
+    return env
+
+
+def with_a_heavy_torso(base: Any) -> None:
+    base.model.body_mass[1] *= 2.0
+
+
+def with_a_reward_of_its_own(base: Any) -> None:
+    base.control_cost = lambda action: 0.0
+
+
 CHOICES: dict[str, tuple[Callable[[], gym.Env], bool]] = {
     "task": (lambda: gym.make("HalfCheetah-v5"), True),
     "monitored task": (lambda: Monitor(gym.make("HalfCheetah-v5")), True),
     "with pictures": (lambda: gym.make("HalfCheetah-v5", render_mode="rgb_array", width=64), True),
     "wrapped task": (lambda: ClipAction(gym.make("HalfCheetah-v5")), False),
     "other arguments": (lambda: gym.make("HalfCheetah-v5", ctrl_cost_weight=0.2), False),
+    "changed setting": (lambda: changed(lambda base: setattr(base, "_ctrl_cost_weight", 100.0)), False),
+    "changed physics": (lambda: changed(with_a_heavy_torso), False),
+    "changed method": (lambda: changed(with_a_reward_of_its_own), False),
+    "seeded": (lambda: changed(lambda base: base.reset(seed=3)), True),
+    "attribute that the task has not": (lambda: changed(lambda base: setattr(base, "nickname", "Bobby")), True),
     "other version": (lambda: gym.make("HalfCheetah-v4"), False),
     "other environment": (lambda: gym.make("CartPole-v1"), False),
 }
@@ -381,7 +401,7 @@ def test_methods_that_would_need_the_state_are_refused(name: str) -> None:
         env.env_method(name)
 
 
-@pytest.mark.parametrize("name", ["data", "state_vector", "set_state"])
+@pytest.mark.parametrize("name", ["data", "state_vector", "set_state", "model", "unwrapped"])
 def test_the_state_is_not_shown_where_it_stands_still(name: str) -> None:
     with pytest.raises(NotImplementedError, match=f"'{name}'; use DummyVecEnv"):
         pool("HalfCheetah-v5").get_attr(name)

@@ -1,5 +1,7 @@
 """Batches of whole episodes: what belongs to them, and that nothing else changes the update."""
 
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -176,6 +178,14 @@ def test_a_wrong_number_of_episodes_is_refused(wrong: object) -> None:
 def test_a_batch_of_one_episode_is_refused() -> None:
     with pytest.raises(ValueError, match="at least 2 episodes"):
         whole_episodes([[2]])
+
+
+def test_what_learned_from_many_episodes_can_be_watched_in_one_environment(tmp_path: Path) -> None:
+    whole_episodes([[2], [7]]).save(tmp_path / "model")
+    alone = TRPOGAE.load(tmp_path / "model", env=DummyVecEnv([lambda: Stopwatch([2])]))
+    assert alone.predict(np.zeros((1, 2)))[0].shape == (1,)
+    with pytest.raises(ValueError, match="at least 2 episodes"):
+        alone.learn(1)
 
 
 def test_adam_fits_the_same_samples() -> None:

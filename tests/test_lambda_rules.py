@@ -305,6 +305,16 @@ def test_a_schedule_is_followed() -> None:
     assert values == [1.0, 0.875, 0.75, 0.625]
 
 
+def test_a_schedule_begins_anew_with_each_call_of_learn() -> None:
+    model, seen = small_model(vec_env(), gae_lambda=lambda progress: progress), []
+    for n_steps, keep_counting in ((40, False), (2 * 32, False), (2 * 32, True)):
+        log = RolloutLog()
+        model.learn(n_steps, callback=log, reset_num_timesteps=not keep_counting)
+        seen.append([entry["gae_lambda/value"] for entry in log.entries])
+    # The first overshoots by 24 of its 40 steps
+    assert seen == [[1.0, pytest.approx(0.2)], [1.0, 0.5], [0.5, 0.25]]
+
+
 def test_measuring_draws_no_random_numbers_of_training() -> None:
     """The first batches, before λ moves, go as with the fixed λ that it starts from."""
     states = []
@@ -337,7 +347,11 @@ def test_what_was_measured_is_saved(tmp_path: Path) -> None:
     assert isinstance(expected, MeasuredLambda)
     np.testing.assert_array_equal(rule._sums, expected._sums)
     assert loaded.gae_lambda == 0.96
-    for how in ({"gae_lambda": 0.5}, {"custom_objects": {"gae_lambda": 0.5}}):
-        fixed = TRPOGAE.load(tmp_path / "model", env=vec_env(n_envs=4), **how)  # type: ignore[arg-type]
+    replaced = {"gae_lambda": 0.5}
+    for fixed in (
+        TRPOGAE.load(tmp_path / "model", env=vec_env(n_envs=4), **replaced),  # type: ignore[arg-type]
+        TRPOGAE.load(tmp_path / "model", env=vec_env(n_envs=4), custom_objects=replaced),
+        TRPOGAE.load(tmp_path / "model", vec_env(n_envs=4), "cpu", replaced),
+    ):
         train_once(fixed)
         assert fixed.gae_lambda == 0.5

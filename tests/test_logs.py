@@ -6,9 +6,11 @@ from typing import Any
 import pytest
 import sb3_contrib
 import torch as th
-from envs_for_tests import SMALL, AnySpacesEnv, KLProbe, short_model, train_once
+from envs_for_tests import SMALL, AnySpacesEnv, Endless, KLProbe, short_model, train_once
 from gymnasium.wrappers import TimeLimit
+from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import explained_variance
@@ -51,6 +53,15 @@ def test_a_logger_of_the_users_is_used(tmp_path: Path) -> None:
         header.split(",")
     )
     assert len(rows) == 3
+
+
+def test_episodes_whose_end_a_wrapper_hides_are_in_the_mean_as_with_sb3() -> None:
+    found = []
+    for kind, kwargs in ((TRPOGAE, {}), (PPO, {"batch_size": 48})):
+        env = make_vec_env(AnySpacesEnv, 3, wrapper_class=Endless)
+        model = kind("MlpPolicy", env, n_steps=16, seed=0, **kwargs).learn(48)
+        found.append([info["l"] for info in model.ep_info_buffer])
+    assert found == [[5] * 9] * 2
 
 
 def test_verbose_models_print_a_table_and_others_nothing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -281,6 +281,12 @@ def test_a_policy_needs_none_of_sb3s_layers() -> None:
     check_training(small_model(vec_env(), OwnNames, policy_kwargs={}))
 
 
+def test_a_compiled_policy_trains() -> None:
+    model = small_model(vec_env())
+    model.policy = th.compile(model.policy, backend="eager")  # type: ignore[assignment]
+    check_training(model)
+
+
 def test_one_of_two_samples_is_not_few_enough_to_draw() -> None:
     """Batches of whole episodes may be smaller than `n_steps` promises."""
     model = small_model(vec_env(lambda: AnySpacesEnv(length=1), 2), n_episodes=1, sub_sampling_factor=2)

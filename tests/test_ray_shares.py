@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import SMALL, AnySpacesEnv, BadNumberEnv
+from envs_for_tests import SMALL, AnySpacesEnv, BadNumberEnv, Endless
 from gymnasium import spaces
 from local_crew import LocalCrew
 from resuming import differences, everything
@@ -89,6 +89,12 @@ def test_one_worker_is_this_process_with_other_random_numbers(make: Any, setting
     here = trained(make_vec_env(make, 3), DrawAsWorkers(), **settings)
     there = trained(on_workers(make, n_workers=1), **settings)
     assert differences(here, there) == []
+
+
+def test_episodes_whose_end_a_wrapper_hides_are_in_the_mean() -> None:
+    env = make_vec_env(AnySpacesEnv, 3, wrapper_class=Endless, vec_env_cls=RayVecEnv, vec_env_kwargs={"n_workers": 2})  # type: ignore[arg-type]
+    model = make_model(env).learn(STEPS)
+    assert [info["l"] for info in model.ep_info_buffer or ()] == [5] * 9
 
 
 @pytest.mark.parametrize("make", ["CartPole-v1", "GaeCartPole-v0"])

@@ -201,8 +201,8 @@ def test_tables_say_ratios_exponents_and_rates() -> None:
     assert "| update | batch 1 000 to 4 000 | 1.00 | 1.00 | 1.00 | 1.00 |" in tables.growth_table(rows)
     assert "| update | batch 4 000 | 4 | 100.0 | 12 | 6 |" in tables.arithmetic_table(rows)
     targets = tables.targets_table(rows)
-    assert "| 4 000 | 2.00 | 0.50 | yes |" in targets
-    assert "| 4 000 | 2.00 | 0.50 | **no** |" in targets
+    assert "| batch 4 000 | 2.00 | 0.50 | yes |" in targets
+    assert "| batch 4 000 | 2.00 | 0.50 | **no** |" in targets
 
 
 def test_a_part_without_peer_and_limit_has_empty_cells() -> None:

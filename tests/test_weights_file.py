@@ -17,7 +17,7 @@ from envs_for_tests import CHANNEL_FIRST, SMALL, VECTOR, AnySpacesEnv, differing
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3 import PPO
+from stable_baselines3 import A2C, PPO
 
 from sb3_gae import TRPOGAE, MlpPolicy
 from sb3_gae.saving.weights_file import _FORMAT, _digest, read_weights, weights_content
@@ -148,6 +148,35 @@ def test_weights_of_another_algorithm_are_taken(tmp_path: Path) -> None:
     np.testing.assert_array_equal(*(one.predict(observations, deterministic=True)[0] for one in (ours, theirs)))
 
 
+@pytest.mark.parametrize("kind", [A2C, TRPOGAE])
+def test_the_optimiser_of_a_file_of_save_begins_anew(kind: Any, tmp_path: Path) -> None:
+    """A2C's own default has a class of optimiser among the policy's arguments."""
+    of_ours = {} if kind is A2C else {"policy_kwargs": {"optimizer_class": th.optim.AdamW}}
+    theirs = kind("MlpPolicy", vec_env(), n_steps=16, **of_ours)
+    theirs.save(tmp_path / "theirs.zip")
+    ours = TRPOGAE.load_weights(tmp_path / "theirs.zip", vec_env(), n_steps=16)
+    observations = vec_env().reset()
+    np.testing.assert_array_equal(*(one.predict(observations, deterministic=True)[0] for one in (ours, theirs)))
+    assert type(ours.policy.optimizer) is th.optim.Adam
+
+
+def test_arguments_of_the_policy_stand_for_those_that_cannot_be_read(tmp_path: Path) -> None:
+    kwargs = SMALL | {"activation_fn": th.nn.Hardtanh}
+    model = trained(policy_kwargs=kwargs)
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match="`activation_fn` must be one of"):
+        TRPOGAE.load_weights(tmp_path / "model.zip", vec_env())
+    loaded = TRPOGAE.load_weights(tmp_path / "model.zip", vec_env(), policy_kwargs=kwargs)
+    assert differing(state_of(model.policy), state_of(loaded.policy)) == []
+
+
+@pytest.mark.parametrize("by", ["save", "save_weights"])
+@pytest.mark.parametrize("name", ["value_lambda", "curvature_samples", "n_episodes"])
+def test_none_comes_back_as_none(by: str, name: str, tmp_path: Path) -> None:
+    getattr(trained(**{name: None}), by)(tmp_path / "model.zip")
+    assert getattr(TRPOGAE.load_weights(tmp_path / "model.zip", vec_env()), name) is None
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -192,7 +221,7 @@ def resealed(content: bytes, **changes: Any) -> bytes:
         ({"policy_kwargs": ["net_arch"]}, "must be a dictionary"),
         ({"policy_kwargs": {"net_arch": [10**9, 10**9]}}, "more weights than there are"),
         ({"policy_kwargs": {"net_arch": ["os"]}}, "cannot be kept without pickle"),
-        ({"policy_kwargs": {"optimizer_class": "os.system"}}, "cannot be kept without pickle"),
+        ({"policy_kwargs": {"features_extractor_class": "os.system"}}, "cannot be kept without pickle"),
         ({"policy_kwargs": {"activation_fn": "os.system"}}, "`activation_fn` must be one of"),
         ({"policy_kwargs": {"net_arch": [7]}}, "do not fit"),
     ],
@@ -387,11 +416,14 @@ def test_a_tensor_that_is_not_where_the_header_says_is_refused(entry: Any) -> No
         read_weights(struct.pack("<Q", len(header)) + header + data)
 
 
-def test_a_dictionary_of_observations_and_pictures_find_their_policy(tmp_path: Path) -> None:
+def test_a_dictionary_of_observations_and_pictures_find_their_policy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for space, policy in ((spaces.Dict({"one": VECTOR}), "MultiInputPolicy"), (CHANNEL_FIRST, "CnnPolicy")):
+        spec = gym.envs.registration.EnvSpec("AnySpaces-v0", lambda space=space: AnySpacesEnv(space))
+        monkeypatch.setitem(gym.registry, "AnySpaces-v0", spec)
         env = vec_env(lambda space=space: AnySpacesEnv(space))
         model = TRPOGAE(policy, env, n_steps=16, policy_kwargs=SMALL)
         for by in (model.save, model.save_weights):
             by(tmp_path / "model.zip")
-            loaded = TRPOGAE.load_weights(tmp_path / "model.zip", env)
-            assert differing(state_of(model.policy), state_of(loaded.policy)) == []
+            for of in (env, "AnySpaces-v0"):
+                loaded = TRPOGAE.load_weights(tmp_path / "model.zip", of)
+                assert differing(state_of(model.policy), state_of(loaded.policy)) == []

@@ -51,6 +51,11 @@ def test_batches_keep_their_size_whatever_the_number_of_environments(n_envs: int
     assert len(set(sizes)) > 1
 
 
+def test_a_sampled_batch_is_in_steps_whatever_the_settings_have() -> None:
+    settings = {"n_envs": 20, "n_episodes": 1, "n_steps": 1000}
+    assert all((settings | sampled)["n_episodes"] is None for sampled, _ in sample_trials(0, 20))
+
+
 def test_sampled_values_cover_their_ranges() -> None:
     trials = sample_trials(3, 4, n_trials=200)
     assert {name for _, trial in trials for name in trial.params} == {

@@ -27,13 +27,19 @@ _ORIGIN = {
 def targets_table(rows: Sequence[Row]) -> str:
     """
     :param rows: of what was timed
-    :return: each target, what was measured at the largest batch, and whether it is met
+    :return: each target, what was measured at the largest size, and whether it is met
     """
     cells = [
-        [target.title, _whole(batch), f"{found:.2f}", f"{1.0 / found:.2f}", "yes" if found <= target.largest else "**no**"]
-        for target, batch, found in judged(groups_of(rows))
+        [
+            target.title,
+            f"{target.varied} {_whole(size)}",
+            f"{found:.2f}",
+            f"{1.0 / found:.2f}",
+            "yes" if found <= target.largest else "**no**",
+        ]
+        for target, size, found in judged(groups_of(rows))
     ]
-    return markdown_table(["target", "batch", "times the limit's time", "times its speed", "met"], cells)
+    return markdown_table(["target", "at", "times the limit's time", "times its speed", "met"], cells)
 
 
 def parts_table(rows: Sequence[Row]) -> str:

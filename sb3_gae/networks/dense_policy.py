@@ -126,7 +126,8 @@ def _hold_exactly(layers: Sequence[nn.Module], others: Sequence[th.Tensor], para
 def _inherits(policy: ActorCriticPolicy, *methods: str) -> bool:
     """Whether the policy leaves these methods as SB3 wrote them, and no hook changes what a module returns."""
     hooked = any(module._forward_hooks or module._forward_pre_hooks for module in policy.modules())
-    return not hooked and all(getattr(type(policy), method) is getattr(ActorCriticPolicy, method) for method in methods)
+    # A policy that `torch.compile` has wrapped is of a class without any
+    return not hooked and all(getattr(type(policy), method, None) is getattr(ActorCriticPolicy, method) for method in methods)
 
 
 def _features(policy: ActorCriticPolicy, observations: PyTorchObs, extractor: BaseFeaturesExtractor) -> th.Tensor:

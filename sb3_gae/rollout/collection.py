@@ -1,6 +1,6 @@
 """The steps of a rollout, and how they end."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -17,6 +17,7 @@ from sb3_gae.networks.dense_policy import gaussian_layers
 from sb3_gae.networks.layers import StepNetwork, pair_up
 from sb3_gae.rollout.episode_quota import EpisodeQuota
 from sb3_gae.rollout.normalized_steps import step_environments
+from sb3_gae.vec_env.step_infos import StepInfos
 
 Observations = np.ndarray | dict[str, np.ndarray]
 
@@ -204,6 +205,21 @@ def take_steps(
             observations, episode_starts, actions, clipped_actions, new_observations, rewards, dones, infos, env.num_envs
         )
         observations, episode_starts = new_observations, dones
+
+
+def reported_episodes(dones: np.ndarray, infos: Sequence[dict[str, Any]], counts: np.ndarray | None = None) -> np.ndarray:
+    """
+    :param dones: whether each environment's episode ended, shape (N,)
+    :param infos: of the step
+    :param counts: whether the step belongs to the batch, shape (N,); None if all do
+    :return: environments whose ``Monitor`` may have an episode to report. A wrapper around it may have hidden that it ended
+    """
+    if counts is not None:
+        return np.flatnonzero(dones & counts)
+    if isinstance(infos, StepInfos):
+        # No wrapper has seen these steps, and looking at an info makes it
+        return np.flatnonzero(dones)
+    return np.array([env for env, info in enumerate(infos) if dones[env] or "episode" in info], dtype=np.int64)
 
 
 def terminal_observations(step: int, dones: np.ndarray, infos: list[dict[str, Any]]) -> list[TerminalObservation]:

@@ -3,10 +3,12 @@
 import json
 import os
 import re
+from contextlib import closing
 from numbers import Real
 from pathlib import Path
 from typing import Any, Self, cast
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -25,6 +27,7 @@ _SETTINGS = (
     *("vf_trust_region", "vf_steps", "vf_cg_max_steps", "vf_cg_damping", "vf_kl_fraction", "vf_optimizer"),
     *("normalize_value", "curvature_samples", "n_episodes", "baseline", "value_fit_first", "use_sde", "sde_sample_freq"),
 )
+_MAY_BE_NONE = ("value_lambda", "curvature_samples", "n_episodes")
 _OF_ADAM = ("learning_rate", "batch_size", "n_critic_updates")
 _FLAGS = ("ortho_init", "full_std", "use_expln", "squash_output", "share_features_extractor", "normalize_images")
 _ACTIVATIONS = {kind.__name__: kind for kind in (nn.Tanh, nn.ReLU, nn.ELU, nn.LeakyReLU, nn.SiLU, nn.GELU, nn.Sigmoid)}
@@ -66,12 +69,15 @@ class PortableModel(OnPolicyAlgorithm):
         :param kwargs: arguments of the algorithm, in place of those in the file. ``policy``, ``policy_kwargs`` and
             ``learning_rate`` are needed where a file of ``save`` has others than the defaults, as far as these are pickled
             there, as every schedule is
-        :return: the model; its optimiser begins anew
+        :return: the model; its optimiser begins anew, and is Adam unless ``policy_kwargs`` are given and say otherwise
         :raises ValueError: if the file is damaged, or does not fit
         :raises TypeError: if an argument in ``kwargs`` is unknown
         """
         file = read_weights(Path(path).read_bytes())
         arguments = _checked_arguments(cls, file) | kwargs
+        if "policy_kwargs" not in arguments:
+            # Only then: what is passed may stand for what cannot be read
+            arguments["policy_kwargs"] = _read_policy_kwargs(_without_optimizer(file.settings.get("policy_kwargs")))
         arguments["policy_kwargs"] = policy_kwargs = dict(arguments["policy_kwargs"] or {})
         _check_size(policy_kwargs, file.tensors)
         policy = arguments.pop("policy", None)
@@ -125,7 +131,7 @@ def _checked_arguments(cls: type[OnPolicyAlgorithm], file: WeightsFile) -> dict[
     arguments: dict[str, Any] = {}
     for name in (*_SETTINGS, *(_OF_ADAM if uses_adam else ())):
         value = file.settings.get(name)
-        if value is not None and isinstance(value, bool | int | float | str):
+        if isinstance(value, bool | int | float | str) or (value is None and name in file.settings and name in _MAY_BE_NONE):
             arguments[name] = value
     if "learning_rate" in arguments:
         # The constructor hands it to torch as it is
@@ -135,8 +141,14 @@ def _checked_arguments(cls: type[OnPolicyAlgorithm], file: WeightsFile) -> dict[
     if (policy := file.settings.get("policy")) is not None:
         check_choice("policy", policy, tuple(cls.policy_aliases))
         arguments["policy"] = policy
-    arguments["policy_kwargs"] = _read_policy_kwargs(file.settings.get("policy_kwargs") or {})
     return arguments
+
+
+def _without_optimizer(written: Any) -> Any:
+    """The optimiser begins anew, with what it is made from."""
+    if not isinstance(written, dict):
+        return {} if written is None else written
+    return {name: value for name, value in written.items() if name not in ("optimizer_class", "optimizer_kwargs")}
 
 
 def _read_policy_kwargs(written: Any) -> dict[str, Any]:
@@ -185,6 +197,9 @@ def _check_size(policy_kwargs: dict[str, Any], tensors: dict[str, th.Tensor]) ->
 
 
 def _policy_for(env: GymEnv | str) -> str:
+    if isinstance(env, str):
+        with closing(gym.make(env)) as made:
+            return _policy_for(made)
     space = getattr(env, "observation_space", None)
     if isinstance(space, spaces.Dict):
         return "MultiInputPolicy"

@@ -1,5 +1,6 @@
 """Gymnasium's MuJoCo tasks, stepped in batches by EnvPool."""
 
+import functools
 import warnings
 from collections.abc import Callable, Sequence
 from types import ModuleType
@@ -11,6 +12,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 
 from sb3_gae.envs.mujoco_task import is_physical
 from sb3_gae.vec_env.batched_vec_env import BatchedVecEnv, make_envs
+from sb3_gae.vec_env.likeness import are_equal, serialized
 from sb3_gae.vec_env.monitoring import begin_episode
 from sb3_gae.vec_env.wrappers import foreign_wrapper
 
@@ -31,8 +33,8 @@ _NO_INFO = ("env_id", "players", "elapsed_step")
 # Arguments of gymnasium's environments that do not touch a trajectory
 _OF_PICTURES = ("render_mode", "width", "height", "camera_id", "camera_name", "default_camera_config", "max_geom")
 
-# What of a gymnasium environment shows or moves its state, which here never moves
-_OF_THE_STATE = ("data", "state_vector", "set_state", "do_simulation", "reset_model", "step", "reset")
+# What of a gymnasium environment shows or moves its state, which here never moves, or changes its physics, which are EnvPool's
+_OF_THE_STATE = ("data", "state_vector", "set_state", "do_simulation", "reset_model", "step", "reset", "model", "unwrapped")
 
 # EnvPool's own time limit, which we have no use for: it cannot tell a limit from an end that comes in the same step
 _NEVER = np.iinfo(np.int32).max
@@ -54,7 +56,7 @@ class EnvPoolVecEnv(BatchedVecEnv):
     Attributes are theirs, so are the methods of ``Monitor``; methods that would have to know the present state are
     refused, and there are no pictures.
 
-    :param env_fns: each makes a gymnasium MuJoCo environment of version 5 with its default arguments
+    :param env_fns: each makes a gymnasium MuJoCo environment of version 5 with its default arguments, and leaves it so
     :param n_threads: that step the physics; None for as many as there are cores
     :raises ImportError: if EnvPool is not installed
     :raises ValueError: if there is no environment or one of them comes twice, is of another kind, has a wrapper that
@@ -68,8 +70,8 @@ class EnvPoolVecEnv(BatchedVecEnv):
         for env in envs:
             if not can_pool(env):
                 raise ValueError(
-                    f"EnvPoolVecEnv steps gymnasium's MuJoCo tasks of version 5 with their default arguments, got {env}; "
-                    "use DummyVecEnv for it."
+                    "EnvPoolVecEnv steps gymnasium's MuJoCo tasks of version 5 as `gym.make` makes them by default, "
+                    f"got {env}; use DummyVecEnv for it."
                 )
         if len(ids := {env.spec.id for env in envs if env.spec}) > 1:
             raise ValueError(f"All environments of an EnvPoolVecEnv must be of one task, got {', '.join(sorted(ids))}.")
@@ -184,7 +186,37 @@ def can_pool(env: gym.Env) -> bool:
     own_arguments = {name: value for name, value in spec.kwargs.items() if name not in _OF_PICTURES}
     if own_arguments != as_registered.kwargs or spec.entry_point != as_registered.entry_point:
         return False
-    return foreign_wrapper(env) is None and (envpool := _envpool()) is not None and spec.id in envpool.list_all_envs()
+    if foreign_wrapper(env) is not None or (envpool := _envpool()) is None or spec.id not in envpool.list_all_envs():
+        return False
+    return _is_as_made(env.unwrapped, spec.id)
+
+
+def _is_as_made(base: Any, task_id: str) -> bool:
+    """Whether nobody has changed a setting, a method or the physics since."""
+    settings, model = _as_made(task_id)
+    own = vars(base)
+    return (
+        all(name in own and are_equal(own[name], value) for name, value in settings.items())
+        and not any(callable(getattr(type(base), name, None)) for name in own)
+        and serialized(base.model) == model
+    )
+
+
+@functools.cache
+def _as_made(task_id: str) -> tuple[dict[str, Any], bytes]:
+    """Settings that are numbers or such, and the physics."""
+    env = gym.make(task_id)
+    base: Any = env.unwrapped
+    plain = (bool, int, float, str, tuple, np.ndarray)
+    settings = {
+        name: value
+        for name, value in vars(base).items()
+        # What it was made with has been looked at, and a camera may be among that
+        if isinstance(value, plain) and name not in _OF_PICTURES and not name.startswith("_ezpickle")
+    }
+    model = serialized(base.model)
+    env.close()
+    return settings, model
 
 
 def _envpool() -> ModuleType | None:

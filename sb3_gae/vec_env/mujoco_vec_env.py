@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvS
 from sb3_gae.envs.mujoco_env import MujocoTaskEnv
 from sb3_gae.envs.mujoco_task import MujocoTask, is_physical, total_reward
 from sb3_gae.vec_env.batched_vec_env import BatchedVecEnv, make_envs
+from sb3_gae.vec_env.likeness import are_equal, serialized
 from sb3_gae.vec_env.wrappers import foreign_wrapper
 
 # Where the batch stands; all else is scratch, or belongs to the environments
@@ -177,9 +178,9 @@ def have_common_task(envs: Sequence[gym.Env]) -> bool:
     :return: whether they are of one task with the same model and the same settings
     """
     first, *others = (cast(MujocoTaskEnv, env.unwrapped).task for env in envs)
-    model = _serialized(first)
+    model = serialized(first.model)
     return all(
-        type(task) is type(first) and _are_equal(_settings_of(task), _settings_of(first)) and _serialized(task) == model
+        type(task) is type(first) and are_equal(_settings_of(task), _settings_of(first)) and serialized(task.model) == model
         for task in others
     )
 
@@ -203,21 +204,3 @@ def _base_of(env: gym.Env) -> MujocoTaskEnv:
 
 def _settings_of(task: MujocoTask) -> dict[str, Any]:
     return {name: value for name, value in vars(task).items() if name not in ("model", "_initial_data")}
-
-
-def _serialized(task: MujocoTask) -> bytes:
-    model = np.empty(mujoco.mj_sizeModel(task.model), dtype=np.uint8)
-    mujoco.mj_saveModel(task.model, None, model)
-    return model.tobytes()
-
-
-def _are_equal(one: Any, other: Any) -> bool:
-    if type(one) is not type(other):
-        return False
-    if isinstance(one, np.ndarray):
-        return bool(np.array_equal(one, other))
-    if isinstance(one, dict):
-        return one.keys() == other.keys() and all(_are_equal(one[key], other[key]) for key in one)
-    if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(_are_equal, one, other))
-    return bool(one == other)

@@ -7,7 +7,14 @@ import numpy as np
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_gae.rollout.collection import Observations, RolloutPlan, Step, environment_actions, take_steps
+from sb3_gae.rollout.collection import (
+    Observations,
+    RolloutPlan,
+    Step,
+    environment_actions,
+    reported_episodes,
+    take_steps,
+)
 from sb3_gae.rollout.episode_quota import EpisodeQuota
 from sb3_gae.workers.moments import Moments
 
@@ -17,7 +24,7 @@ ObservationMoments = dict[str | None, Moments]
 
 class Ending(NamedTuple):
     """
-    :param step: of the share, the last of an episode
+    :param step: of the share, the last of an episode, be it only for the environment's monitor
     :param env: number of the environment in the share
     :param info: of that step
     """
@@ -85,7 +92,8 @@ def collect_share(
     steps: list[Step] = []
     endings: list[Ending] = []
     for step in take_steps(policy, env, observations, episode_starts, plan, quota, first_env):
-        endings.extend(Ending(len(steps), env_, step.infos[env_]) for env_ in np.flatnonzero(step.dones).tolist())
+        reported = reported_episodes(step.dones, step.infos).tolist()
+        endings.extend(Ending(len(steps), env_, step.infos[env_]) for env_ in reported)
         quota.add(step.dones)
         # The infos of other steps may be many; they are not kept
         steps.append(step._replace(infos=[]))

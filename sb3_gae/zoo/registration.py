@@ -249,6 +249,8 @@ def convert_trpo_gae_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
 
     return {
         "n_steps": 2 ** hyperparams.pop("n_steps_pow"),
+        # Where the settings of a task have whole episodes in a batch, the steps would be the most that one may take
+        "n_episodes": None,
         "gamma": 1 - hyperparams.pop("one_minus_gamma"),
         "gae_lambda": 1 - hyperparams.pop("one_minus_gae_lambda"),
         "value_lambda": VALUE_LAMBDAS[hyperparams.pop("value_lambda")],
