@@ -56,9 +56,9 @@ class GradientDiagnosticsCallback(BaseCallback):
     collected it. A single rollout says little; average the curves over several. A rollout of a single trajectory is left out.
 
     Keys are ``gradient/<quantity>/lambda_<value>``, the quantities those of :class:`~sb3_gae.LambdaErrors`,
-    too long ones not in SB3's table. The estimates of the last rollout that had any are in ``self.errors``. Beside them, to compare: ``value_error/<measure>``
-    with the measures of :class:`~sb3_gae.estimators.measures.ValueErrors`, which are in ``self.value_errors``, and
-    ``value_error/policy_gradient``, the bias squared at :math:`\lambda = 0`
+    too long ones not in SB3's table. The estimates of the last rollout that had any are in ``self.errors``. Beside them, to
+    compare: ``value_error/<measure>`` with the measures of :class:`~sb3_gae.estimators.measures.ValueErrors`, which are in
+    ``self.value_errors``, and ``value_error/policy_gradient``, the bias squared at :math:`\lambda = 0`
     (:func:`~sb3_gae.diagnostics.rollout_diagnostics.policy_gradient_value_error`).
 
     :param lambdas: weights of longer estimates, each in [0, 1]
