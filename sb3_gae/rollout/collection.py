@@ -17,7 +17,6 @@ from sb3_gae.networks.dense_policy import gaussian_layers
 from sb3_gae.networks.layers import StepNetwork, pair_up
 from sb3_gae.rollout.episode_quota import EpisodeQuota
 from sb3_gae.rollout.normalized_steps import step_environments
-from sb3_gae.vec_env.step_infos import StepInfos
 
 Observations = np.ndarray | dict[str, np.ndarray]
 
@@ -216,8 +215,8 @@ def reported_episodes(dones: np.ndarray, infos: Sequence[dict[str, Any]], counts
     """
     if counts is not None:
         return np.flatnonzero(dones & counts)
-    if isinstance(infos, StepInfos):
-        # No wrapper has seen these steps, and looking at an info makes it
+    if not isinstance(infos, list):
+        # Of a batch, which no wrapper has seen one by one: there looking at an info makes it
         return np.flatnonzero(dones)
     return np.array([env for env, info in enumerate(infos) if dones[env] or "episode" in info], dtype=np.int64)
 
