@@ -111,7 +111,8 @@ class ExplainedVarianceLambda:
 
     def learn_from(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> dict[str, float]:
         """
-        Take the batch into the average, unless its explained variance is not finite, as where all returns are equal.
+        Take the batch into the average, unless its explained variance is not finite, as where all returns are equal. It counts
+        as -1 at least: where they are nearly equal it has no bound.
 
         :param policy: not looked at
         :param rollout_buffer: full, with its advantages computed
@@ -121,7 +122,7 @@ class ExplainedVarianceLambda:
         returns = discounted_returns(buffer.rewards, buffer.next_values, buffer.dones, buffer.gamma)
         found = explained_variance(buffer.values[buffer.mask], returns[buffer.mask])
         if np.isfinite(found):
-            self.explained_variance = self.memory * self.explained_variance + (1.0 - self.memory) * found
+            self.explained_variance = self.memory * self.explained_variance + (1.0 - self.memory) * max(found, -1.0)
         return {"explained_variance": self.explained_variance}
 
 

@@ -2,12 +2,13 @@
 A task for tests of sweeps, to be imported with ``--gym-packages``.
 
 It writes down every run in the working folder, waits while there is a file ``hold-SEED``, fails if there is one
-``fail-SEED``, and takes longer and longer steps while there is one ``slow-SEED``. ``SWEEP_HOST`` in the environment names
-the machine.
+``fail-SEED``, asks for the end of the program if there is one ``exit-SEED``, and takes longer and longer steps while there
+is one ``slow-SEED``. ``SWEEP_HOST`` in the environment names the machine.
 """
 
 import os
 import socket
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ class WitnessedEnv(CartPoleEnv):
                 time.sleep(0.01)
             if Path(f"fail-{seed}").exists():
                 raise RuntimeError("the motor\nis broken")
+            if Path(f"exit-{seed}").exists():
+                sys.exit("no licence")
         return super().reset(seed=seed, options=options)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

@@ -221,6 +221,17 @@ def test_the_simple_rule_trusts_a_value_function_that_explains_more() -> None:
     assert rule.value(1.0) == pytest.approx(0.9, abs=0.001)
 
 
+def test_a_batch_of_nearly_equal_returns_does_not_count_for_many() -> None:
+    rule = ExplainedVarianceLambda(lowest=0.9, memory=0.5)
+    model = small_model(vec_env(n_envs=4), n_steps=40)
+    train_once(model)
+    buffer, rng = model.rollout_buffer, np.random.default_rng(0)
+    buffer.rewards = 1e-5 * rng.normal(size=buffer.rewards.shape)
+    buffer.values = rng.normal(size=buffer.values.shape)
+    buffer.last_values[:], buffer.bootstrap_values[:] = 0.0, 0.0
+    assert rule.learn_from(model.policy, buffer) == {"explained_variance": -0.5}
+
+
 # In training
 
 

@@ -99,6 +99,11 @@ def test_cells_that_fail_are_told(capsys: pytest.CaptureFixture[str]) -> None:
         ([*RUN, "--gammas", "1", "--seeds", "1", "-params", "vf_steps:"], "written as name:value, got 'vf_steps:'"),
         (["run", "--env", "CartPole-v1", "--gammas", "1", "--seeds", "1", "--iterations", "1"], "`lambdas` is missing"),
         (["run", "--preset", "small", "--iterations", "0"], "`iterations` must be a whole number of at least 1, got 0"),
+        (
+            [*RUN, "--gammas", "1", "--seeds", "1", "--first-seed", "5000000000"],
+            "`seeds` must be a number in [0, 4.29497e+09]",
+        ),
+        ([*RUN, "--gammas", "1", "--seeds", "1", "--dry-run", "-params", "n_steps:0"], "cannot be run: `n_steps` must be"),
         (["status", "--preset", "nopreset"], "`preset` knows fig2-left, "),
         (["status", "--name", "s", "--storage", "sqlite:///s.db"], "There is no sweep at sqlite:///s.db"),
         ([*RUN, "--gammas", "1", "--first-seed", "4"], "`first-seed` needs --seeds"),

@@ -31,7 +31,11 @@ def test_a_file_that_holds_more_or_something_else_is_not_replaced(sweep_table: p
         export(sweep_table[sweep_table["trial"] > 0], path)
     with pytest.raises(SweepError, match="holds the sweep 's'; name another file"):
         export(sweep_table.assign(sweep="other"), path)
+    changed = sweep_table.assign(mean_return=sweep_table["mean_return"] + (sweep_table["trial"] == 1))
+    with pytest.raises(SweepError, match="has other results than the storage for 1 of the runs that both have"):
+        export(changed, path)
     assert path.read_bytes() == before
+    export(sweep_table.assign(seconds=7.0), path)
     (tmp_path / "letter.csv").write_text("Dear Sir,\n")
     with pytest.raises(SweepError, match="exists and is not replaced"):
         export(sweep_table, tmp_path / "letter.csv")

@@ -5,6 +5,7 @@ import json
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pytest
 
 from sb3_gae import TRPOGAE
@@ -97,6 +98,14 @@ def test_a_preset_takes_another_size_and_task() -> None:
     assert json.loads(cells[0].overrides) == {"n_steps": 782, "vf_steps": 2}
 
 
+def test_arrays_are_lists() -> None:
+    plain = make_cells(env="CartPole-v1", gammas=[0.9, 0.99], lambdas=[0.9, 1.0], seeds=[0, 1], iterations=2)
+    gammas, lambdas, iterations = np.array([0.9, 0.99]), np.linspace(0.9, 1.0, 2), np.int64(2)
+    for seeds in (np.arange(2), np.int64(2)):
+        of_arrays = make_cells(env="CartPole-v1", gammas=gammas, lambdas=lambdas, seeds=seeds, iterations=iterations)  # type: ignore[arg-type]
+        assert [cell.key for cell in of_arrays] == [cell.key for cell in plain]
+
+
 def test_names_are_fit_for_files() -> None:
     assert default_name("small", ["T-v0"]) == "small"
     assert default_name(None, ["ALE/Pong-v5", "ALE/Pong-v5", "T-v0"]) == "ALE-Pong-v5_T-v0"
@@ -114,6 +123,7 @@ def test_names_are_fit_for_files() -> None:
         ({"seeds": 0}, "`seeds` must be a whole number of at least 1, got 0"),
         ({"seeds": []}, "The grid is empty"),
         ({"seeds": [-1]}, "`seeds` must be a whole number of at least 0"),
+        ({"seeds": [2**32]}, "`seeds` must be a number in [0, 4.29497e+09], got 4294967296"),
         ({"iterations": 0}, "`iterations` must be a whole number of at least 1"),
         ({"conditions": ["adm"]}, "did you mean 'adam'?"),
         ({"env": None}, "`env` is missing"),

@@ -1,6 +1,7 @@
 """Running a sweep: what a cell means, and what happens when something goes wrong."""
 
 import contextlib
+import functools
 import json
 import os
 import resource
@@ -17,7 +18,10 @@ import pandas as pd
 import pytest
 import rl_zoo3.train
 import torch as th
+from envs_for_tests import AnySpacesEnv, Endless, small_model
+from gymnasium.wrappers import TimeLimit
 from local_crew import LocalCrew
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_gae import TRPOGAE, MujocoVecEnv
@@ -25,7 +29,7 @@ from sb3_gae.sweep import CONDITIONS, Cell, SweepError, SweepStudy, results_of, 
 from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.ledger import Outcome, Status
 from sb3_gae.sweep.plan import Options
-from sb3_gae.sweep.recorder import COLUMNS, Row
+from sb3_gae.sweep.recorder import COLUMNS, Recorder, Row
 from sb3_gae.sweep.worker import return_freed_memory
 
 HERE = Path(__file__).parent
@@ -183,6 +187,22 @@ def test_a_failing_cell_is_recorded_and_the_others_go_on() -> None:
     table = run_sweep(seeds=3, **GRID, progress=False, retry_failed=True)
     assert sorted(table["seed"].unique()) == [0, 1, 2]
     assert runs() == [0, 1, 2, 1]
+
+
+def test_a_task_that_ends_the_program_ends_its_cell() -> None:
+    Path("exit-0").touch()
+    with pytest.warns(UserWarning, match="seed 0, 2 iterations failed: SystemExit: no licence"):
+        table = run_sweep(seeds=2, **GRID, progress=False)
+    assert table["seed"].unique().tolist() == [1]
+
+
+@pytest.mark.parametrize(("wrapper", "episodes"), [(Endless, 9), (functools.partial(TimeLimit, max_episode_steps=3), 0)])
+def test_ends_that_a_wrapper_hides_or_makes(wrapper: Any, episodes: int) -> None:
+    """`Monitor`, which is further inside, reports what has ended by its own count."""
+    env = make_vec_env(AnySpacesEnv, 3, wrapper_class=wrapper)
+    rows: list[Row] = []
+    small_model(env, n_steps=16).learn(48, callback=Recorder(1, rows.append))
+    assert [row["episodes"] for row in rows] == [episodes]
 
 
 def test_results_carry_where_they_come_from() -> None:

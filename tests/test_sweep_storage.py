@@ -124,6 +124,10 @@ def test_other_formats_and_other_studies_are_refused(journal: str) -> None:
     with pytest.raises(SweepError, match=r"is no sweep of sb3-gae; choose another --name"):
         SweepStudy("other", journal)
     assert Path(journal).read_bytes() == before
+    optuna.create_study(storage=storage_of(journal), study_name="somebody's")
+    before = Path(journal).read_bytes()
+    SweepStudy("somebody's", journal, create=False)
+    assert Path(journal).read_bytes() == before
 
 
 @pytest.mark.parametrize(
@@ -150,6 +154,17 @@ def test_storages_that_cannot_be_used(location: str, message: str, tmp_path: Pat
     assert message in str(error.value)
     assert "\n" not in str(error.value) and "secret" not in str(error.value)
     assert (tmp_path / "file").read_text() == "these are\nno results\n"
+
+
+def test_a_database_of_another_optuna_is_told_in_one_line(tmp_path: Path) -> None:
+    location = f"sqlite:///{tmp_path}/old.db"
+    optuna.create_study(storage=location, study_name="s")
+    with contextlib.closing(sqlite3.connect(tmp_path / "old.db")) as database:
+        database.execute("update version_info set schema_version = 11")
+        database.execute("update alembic_version set version_num = 'v2.6.0.a'")
+        database.commit()
+    with pytest.raises(SweepError, match="schema"):
+        SweepStudy("s", location, create=False)
 
 
 @pytest.mark.parametrize("driver", ["psycopg2", "psycopg"])

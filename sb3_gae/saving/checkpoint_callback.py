@@ -97,7 +97,8 @@ class ResumableCheckpointCallback(BaseCallback):
     def _check_folder(self) -> None:
         newer = [
             path
-            for path in checkpoints_in(self.save_path, self.name_prefix)
+            # Whatever their prefix: `resume` takes the newest in the folder
+            for path in checkpoints_in(self.save_path)
             if timesteps_of(path) > self.model.num_timesteps and is_whole(path)
         ]
         if newer:

@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import math
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ import pandas as pd
 from sb3_gae.sweep.arguments import make_parser, selection_of
 from sb3_gae.sweep.cost import estimate_cost
 from sb3_gae.sweep.errors import SweepError
-from sb3_gae.sweep.export import export
+from sb3_gae.sweep.export import SUFFIXES, export
 from sb3_gae.sweep.figures import draw
 from sb3_gae.sweep.ledger import Status
 from sb3_gae.sweep.machine import check_jobs
@@ -88,7 +89,9 @@ def _dry_run(plan: Plan, jobs: int) -> int:
     print(overview(plan.name, table))
     for cost in estimate_cost(plan, table):
         print(f"{cost.task}: {cost.cells} cells with {cost.iterations} iterations left")
-        print(f"  {_time_range(cost.low / jobs, cost.high / jobs)} in {jobs} job(s), from {cost.basis}")
+        # A cell is not shared: the last ones may leave jobs without work
+        share = math.ceil(cost.cells / jobs) / cost.cells
+        print(f"  {_time_range(cost.low * share, cost.high * share)} in {jobs} job(s), from {cost.basis}")
     return 0
 
 
@@ -165,7 +168,8 @@ def _results_of(args: argparse.Namespace) -> tuple[pd.DataFrame, str]:
             raise SweepError("`from` names files; leave out --storage, --name and --preset, or --from.")
         tables = ((file, read_results(file)) for file in args.sources)
         table = combine(tables, matters=selection_of(args).has)
-        return table, Path(args.sources[0]).name.split(".")[0]
+        name = Path(args.sources[0]).name
+        return table, next((name.removesuffix(suffix) for suffix in SUFFIXES if name.endswith(suffix)), name)
     study = _study_of(args)
     return results_of(study), study.name
 

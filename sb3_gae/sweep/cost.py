@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from sb3_gae.errors import NumericalError
+from sb3_gae.sweep.errors import SweepError, in_one_line
 from sb3_gae.sweep.experiment import Experiment
 from sb3_gae.sweep.grid import Cell
 from sb3_gae.sweep.ledger import Standing, Status
@@ -65,8 +67,11 @@ def _from_probe(left: Sequence[Cell], plan: Plan) -> Cost:
     cell = left[0]
     probe = Cell(cell.task, cell.condition, cell.gamma, cell.gae_lambda, cell.seed, 2, cell.overrides)
     rows: list[Row] = []
-    experiment = Experiment(probe, plan.options)
-    experiment.run(rows.append)
+    try:
+        experiment = Experiment(probe, plan.options)
+        experiment.run(rows.append)
+    except (ValueError, TypeError, NumericalError) as error:
+        raise SweepError(f"The first of its cells, {cell}, cannot be run: {in_one_line(error)}") from error
     each = rows[-1]["seconds"]
     steps = rows[-1]["timesteps"] - rows[0]["timesteps"]
     # Episodes lengthen as the policy learns, up to the most that the settings allow

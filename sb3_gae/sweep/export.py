@@ -8,7 +8,7 @@ import pandas as pd
 
 from sb3_gae.sweep.errors import SweepError
 from sb3_gae.sweep.results import NO_PARQUET, identities, is_parquet, read_results
-from sb3_gae.sweep.runs import STATE_COLUMN
+from sb3_gae.sweep.runs import STATE_COLUMN, different_results, finished
 
 SUFFIXES = (".csv", ".csv.gz", ".parquet")
 
@@ -46,6 +46,11 @@ def _check_replaceable(table: pd.DataFrame, path: Path) -> None:
         raise SweepError(f"`output`: {path} holds the sweep {', '.join(sorted(other))!r}; name another file or remove it.")
     if STATE_COLUMN in before and STATE_COLUMN not in table:
         raise SweepError(f"`output`: {path} has runs that are not finished, too; pass --partial, or name another file.")
+    if others := different_results(finished(before), finished(table)):
+        raise SweepError(
+            f"`output`: {path} has other results than the storage for {others} of the runs that both have, as after a change "
+            "of settings or code; name another file or remove it."
+        )
     if lost := len(identities(before) - identities(table)):
         raise SweepError(f"`output`: {path} holds {lost} rows that are not in the storage; name another file or remove it.")
 

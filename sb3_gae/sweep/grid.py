@@ -10,6 +10,9 @@ from sb3_gae.checks import check_count, check_number
 from sb3_gae.sweep.conditions import find_condition
 from sb3_gae.sweep.errors import SweepError, checks
 
+#: of NumPy's and torch's seeds as SB3 sets them
+LARGEST_SEED = 2**32 - 1
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -41,8 +44,11 @@ class Cell:
             if uses_lambda:
                 check_number("gae_lambda", self.gae_lambda, 0.0, 1.0)
             check_count("seeds", self.seed, low=0)
+            check_number("seeds", self.seed, 0, LARGEST_SEED)
             check_count("iterations", self.iterations)
-        # 0 and 0.0 are one cell, and so are all λ where λ has no meaning
+        # 0 and 0.0 are one cell, numbers of NumPy those of Python, and so are all λ where λ has no meaning
+        object.__setattr__(self, "seed", int(self.seed))
+        object.__setattr__(self, "iterations", int(self.iterations))
         object.__setattr__(self, "gamma", float(self.gamma))
         object.__setattr__(self, "gae_lambda", float(self.gae_lambda) if uses_lambda else None)  # type: ignore[arg-type]
 

@@ -4,6 +4,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from sb3_gae.checks import check_count
 from sb3_gae.sweep.conditions import find_condition
 from sb3_gae.sweep.errors import SweepError, checks
@@ -86,13 +88,18 @@ def make_cells(
         for name, needed in {"env": tasks, "gammas": gammas, "seeds": seeds, "iterations": iterations}.items():
             if needed is None:
                 raise SweepError(f"`{name}` is missing; give it, or a preset.")
-        conditions, lambdas = ["trust_region"] if conditions is None else list(conditions), list(lambdas or ())
+        conditions, lambdas = ["trust_region"] if conditions is None else list(conditions), _listed(lambdas)
         needing = [name for name in conditions if find_condition(name).uses_lambda]
         if needing and not lambdas:
             raise SweepError(f"`lambdas` is missing, of which the condition {needing[0]!r} needs at least one.")
-        curves = product(conditions, gammas or (), lambdas)
-    which = range(check_seeds(seeds)) if isinstance(seeds, int) else list(seeds or ())
+        curves = product(conditions, _listed(gammas), lambdas)
+    which = range(check_seeds(seeds)) if isinstance(seeds, int | np.integer) else _listed(seeds)
     return cells_of(tasks or [], curves, which, iterations or 0, hyperparams)
+
+
+def _listed(values: Iterable[Any] | None) -> list[Any]:
+    # Arrays, too, of which there is no telling whether they are true
+    return [] if values is None else list(values)
 
 
 def check_seeds(count: int) -> int:

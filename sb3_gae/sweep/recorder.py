@@ -7,6 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_gae.rollout.collection import reported_episodes
+
 #: what is logged of an update, by the name that it has in a row
 _OF_THE_UPDATE = {
     "explained_variance": "train/explained_variance",
@@ -54,12 +56,12 @@ class Recorder(BaseCallback):
         self._call_on_step()
         if self.n_recorded == self.iterations:
             return False
-        dones = self.locals["dones"]
-        if dones.any():
-            # With whole episodes: only those that belong to the batch
-            counts = quota.counts if (quota := self.locals.get("quota")) is not None else None
-            for env in np.flatnonzero(dones if counts is None else dones & counts):
-                episode = self.locals["infos"][env]["episode"]
+        infos = self.locals["infos"]
+        # With whole episodes: only those that belong to the batch
+        counts = quota.counts if (quota := self.locals.get("quota")) is not None else None
+        for env in reported_episodes(self.locals["dones"], infos, counts).tolist():
+            # Where a wrapper outside `Monitor` ended it there is none to report
+            if (episode := infos[env].get("episode")) is not None:
                 self._returns.append(episode["r"])
                 self._lengths.append(episode["l"])
         return True

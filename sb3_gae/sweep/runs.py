@@ -97,6 +97,16 @@ def combine(
     return pd.concat(runs, ignore_index=True) if runs else tables[0][1]
 
 
+def different_results(one: pd.DataFrame, other: pd.DataFrame) -> int:
+    """
+    :param one: of finished runs
+    :param other: likewise
+    :return: number of the cells that are in both with different results
+    """
+    first, second = ({cell_of(run.iloc[0]).key: run for run in runs_of(table)} for table in (one, other))
+    return sum(not _have_same_results(first[key], second[key]) for key in first.keys() & second.keys())
+
+
 def _have_same_results(first: pd.DataFrame, second: pd.DataFrame) -> bool:
     one, other = (run.sort_values("iteration")[_RESULT_COLUMNS].to_numpy(float) for run in (first, second))
     return np.array_equal(one, other, equal_nan=True)

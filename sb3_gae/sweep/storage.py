@@ -215,8 +215,10 @@ def storage_errors(location: str) -> Iterator[None]:
     except (OSError, SQLAlchemyError, ImportError, optuna.exceptions.OptunaError) as error:
         kind = UnreachableError if is_server(location) and _is_outage(error) else SweepError
         raise kind(_explain(location, error)) from error
-    except (ValueError, KeyError, TypeError, AssertionError) as error:
-        # What reading a journal that is none ends in
+    except (ValueError, KeyError, TypeError, AssertionError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and type(error) is not RuntimeError:
+            raise
+        # What reading a journal that is none ends in, or a database that another version of Optuna has made
         raise SweepError(_explain(location, error)) from error
 
 

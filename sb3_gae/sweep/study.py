@@ -16,7 +16,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from sb3_gae.sweep.agreement import Made, changes, check_made_with
 from sb3_gae.sweep.errors import SweepError
-from sb3_gae.sweep.grid import Cell
+from sb3_gae.sweep.grid import LARGEST_SEED, Cell
 from sb3_gae.sweep.ledger import Outcome, Standing, Status, duplicates, standings
 from sb3_gae.sweep.liveness import SILENT_AFTER, beat_every, sign_of_life, why_dead
 from sb3_gae.sweep.location import without_password
@@ -32,7 +32,7 @@ _FORMAT_ATTRIBUTE = "sb3_gae_sweep_format"
 _DISTRIBUTIONS: dict[str, BaseDistribution] = {
     "gamma": FloatDistribution(0.0, 1.0),
     "gae_lambda": FloatDistribution(0.0, 1.0),
-    "seed": IntDistribution(0, 2**32 - 1),
+    "seed": IntDistribution(0, LARGEST_SEED),
 }
 
 
@@ -100,15 +100,16 @@ class SweepStudy:
             study.set_user_attr(_FORMAT_ATTRIBUTE, FORMAT)
             return study
         study = optuna.load_study(study_name=self.name, storage=self.storage)
-        self._check_format(study)
+        self._check_format(study, create)
         return study
 
-    def _check_format(self, study: optuna.Study) -> None:
+    def _check_format(self, study: optuna.Study, create: bool) -> None:
         # In this order: whoever begins the sweep at this moment writes the format first
         is_empty = not study.get_trials(deepcopy=False)
         found = study.user_attrs.get(_FORMAT_ATTRIBUTE)
         if found is None and is_empty:
-            study.set_user_attr(_FORMAT_ATTRIBUTE, FORMAT)  # begun by a process that did not get this far
+            if create:
+                study.set_user_attr(_FORMAT_ATTRIBUTE, FORMAT)  # begun by a process that did not get this far
         elif found != FORMAT:
             what = "is no sweep of sb3-gae" if found is None else f"is of format {found}, and this sb3-gae knows {FORMAT}"
             advice = "choose another --name" if found is None else "use the sb3-gae that wrote it, or another --name"

@@ -156,8 +156,9 @@ def run_claim(claim: Claim, options: Options, stop: StopRequest) -> None:
         _give_up(claim, curve, Outcome.STOPPED, stop.reason or "stopped")
     except SweepError:
         raise
-    except Exception as error:
-        # Its end is the innermost, and a database may have no room for more
+    except (Exception, SystemExit) as error:
+        # A task that asks for the end of the program ends its cell. The end of a traceback is the innermost, and a database
+        # may have no room for more
         _give_up(
             claim, curve, Outcome.FAILED, _reason_of(error), traceback="".join(traceback.format_exception(error))[-20_000:]
         )
@@ -172,7 +173,7 @@ def _give_up(claim: Claim, curve: "_CurveWriter", outcome: Outcome, reason: str,
         pass
 
 
-def _reason_of(error: Exception) -> str:
+def _reason_of(error: BaseException) -> str:
     last = traceback.extract_tb(error.__traceback__)[-1]
     what = in_one_line(error, longest=None)
     return f"{type(error).__name__}: {what} [{last.name}, {last.filename.rsplit('/', 1)[-1]}:{last.lineno}]"
