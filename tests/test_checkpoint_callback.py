@@ -42,11 +42,15 @@ def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {foreign.name, "other_7_steps.zip", "rl_model_320_steps.zip"}
 
 
-def test_the_checkpoints_of_a_training_that_is_ahead_are_not_mixed_with(checkpoints: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("prefix", ["rl_model", "another"])
+def test_the_checkpoints_of_a_training_that_is_ahead_are_not_mixed_with(
+    prefix: str, checkpoints: Path, tmp_path: Path
+) -> None:
+    """Whatever their names: `resume` of the folder takes the newest."""
     copy_of(checkpoints, tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     with pytest.raises(ValueError, match=r"`save_path` = .* training that is ahead, such as rl_model_256_steps.*resume"):
-        train(tmp_path)
+        train(tmp_path, name_prefix=prefix)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
