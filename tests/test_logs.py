@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import sb3_contrib
 import torch as th
@@ -17,6 +18,7 @@ from stable_baselines3.common.utils import explained_variance
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_gae import TRPOGAE
+from sb3_gae.rollout.collection import reported_episodes
 
 # Outputs
 
@@ -62,6 +64,13 @@ def test_episodes_whose_end_a_wrapper_hides_are_in_the_mean_as_with_sb3() -> Non
         model = kind("MlpPolicy", env, n_steps=16, seed=0, **kwargs).learn(48)
         found.append([info["l"] for info in model.ep_info_buffer])
     assert found == [[5] * 9] * 2
+
+
+@pytest.mark.parametrize("kind", [list, tuple])
+def test_ends_are_looked_for_in_the_infos_of_every_vec_env_of_sb3(kind: type) -> None:
+    """`SubprocVecEnv` has tuples."""
+    infos = kind([{}, {"episode": {}}, {}])
+    assert reported_episodes(np.array([False, False, True]), infos).tolist() == [1, 2]
 
 
 def test_verbose_models_print_a_table_and_others_nothing(capsys: pytest.CaptureFixture[str]) -> None:

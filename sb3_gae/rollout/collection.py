@@ -215,7 +215,7 @@ def reported_episodes(dones: np.ndarray, infos: Sequence[dict[str, Any]], counts
     """
     if counts is not None:
         return np.flatnonzero(dones & counts)
-    if not isinstance(infos, list):
+    if not isinstance(infos, list | tuple):
         # Of a batch, which no wrapper has seen one by one: there looking at an info makes it
         return np.flatnonzero(dones)
     return np.array([env for env, info in enumerate(infos) if dones[env] or "episode" in info], dtype=np.int64)
