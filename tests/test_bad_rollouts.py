@@ -134,17 +134,34 @@ def test_a_bad_parameter_is_named(bad: float, name: str) -> None:
     ],
     ids=str,
 )
-def test_a_bad_action_distribution_is_refused(actions: spaces.Space, bad: float) -> None:
-    """From finite weights: the network itself goes wrong at step 3."""
+@pytest.mark.parametrize("validate_args", [True, False], ids=["torch refuses it", "as after torch.compile"])
+def test_a_bad_action_distribution_is_refused(
+    validate_args: bool, actions: spaces.Space, bad: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From finite weights: the network itself goes wrong from step 3 on."""
+    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", validate_args)
     model = short_model(vec_env(lambda: AnySpacesEnv(VECTOR, actions)))
     calls = []
 
     def go_wrong(module: Any, inputs: Any, outputs: th.Tensor) -> th.Tensor:
         calls.append(True)
-        return th.full_like(outputs, bad) if len(calls) == 4 else outputs
+        return th.full_like(outputs, bad) if len(calls) >= 4 else outputs
 
     model.policy.action_net.register_forward_hook(go_wrong)
     check_refused(model, r"action.* step 3 of the rollout")
+
+
+def test_an_error_of_the_network_itself_is_not_one_of_numbers() -> None:
+    model = short_model(vec_env(lambda: AnySpacesEnv(VECTOR, spaces.Discrete(3))))
+    errors = [RuntimeError("out of memory")]
+
+    def fail_once(module: Any, inputs: Any, outputs: th.Tensor) -> None:
+        if errors:
+            raise errors.pop()
+
+    model.policy.action_net.register_forward_hook(fail_once)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        train_once(model)
 
 
 class BadEvaluation(MlpPolicy):

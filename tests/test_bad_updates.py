@@ -102,20 +102,25 @@ def test_linear_algebra_that_breaks_down_is_a_numerical_error(error: type[Except
     check_refused(model, "linear algebra of the update broke down: no such decomposition")
 
 
-def test_a_trial_that_torch_refuses_is_a_trial_that_failed() -> None:
+@pytest.mark.parametrize("validate_args", [True, False], ids=["torch refuses it", "as after torch.compile"])
+def test_a_trial_without_a_distribution_is_a_trial_that_failed(validate_args: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """With such a radius the first steps make standard deviations of 0. Shorter ones follow, and no error."""
+    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", validate_args)
     refusals = []
 
     class Watched(MlpPolicy):
         def _get_action_dist_from_latent(self, latent_pi: th.Tensor) -> Any:
             try:
-                return super()._get_action_dist_from_latent(latent_pi)
+                distribution = super()._get_action_dist_from_latent(latent_pi)
             except ValueError:
                 refusals.append(True)
                 raise
+            if not th.all(distribution.distribution.stddev > 0.0):
+                refusals.append(False)
+            return distribution
 
     search = {"line_search_shrinking_factor": 0.5, "line_search_max_iter": 60}
     model = short_model(policy=Watched, target_kl=1e6, **search)
     logged = train_once(model)
-    assert len(refusals) > 0
+    assert set(refusals) == {validate_args}
     assert logged["train/is_line_search_success"] == 1.0 and logged["train/line_search_trials"] > len(refusals)

@@ -281,7 +281,9 @@ def test_a_policy_needs_none_of_sb3s_layers() -> None:
     check_training(small_model(vec_env(), OwnNames, policy_kwargs={}))
 
 
-def test_a_compiled_policy_trains() -> None:
+def test_a_compiled_policy_trains(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Compiling switches the check of every distribution off, and for the whole process
+    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", True)
     model = small_model(vec_env())
     model.policy = th.compile(model.policy, backend="eager")  # type: ignore[assignment]
     check_training(model)

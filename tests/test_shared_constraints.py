@@ -131,7 +131,11 @@ def test_a_limit_that_is_used_up_leaves_the_fit_of_frozen_features() -> None:
     assert differing(state_of(policies[0]), state_of(policies[1])) == []
 
 
-def test_distribution_parameters_that_are_not_finite_are_infinitely_far() -> None:
+@pytest.mark.parametrize("validate_args", [True, False], ids=["torch refuses them", "as after torch.compile"])
+def test_distribution_parameters_that_are_not_finite_are_infinitely_far(
+    validate_args: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", validate_args)
     policy = policy_of("all layers")
     batch = training_batch(policy)
     shared = SharedParameters(policy, groups_of(policy, batch), batch, 1e-3)

@@ -147,9 +147,17 @@ class ActionSampler:
         try:
             with th.no_grad():
                 return self._policy._predict(obs_as_tensor(observations, self._policy.device)).cpu().numpy()
-        except ValueError as error:
-            # So torch refuses the parameters of a distribution
+        except (ValueError, RuntimeError) as error:
+            # A distribution refuses its parameters by the first. Where `torch.compile` has switched that check off for the
+            # whole process, drawing from them fails by the second, and so does much else.
+            if isinstance(error, RuntimeError) and self._has_distribution(observations):
+                raise
             raise NumericalError(f"The action distribution is invalid at step {step} of the rollout: {error}") from error
+
+    def _has_distribution(self, observations: Observations) -> bool:
+        with th.no_grad():
+            entropy = self._policy.get_distribution(obs_as_tensor(observations, self._policy.device)).entropy()
+        return entropy is None or bool(entropy.isfinite().all())
 
 
 def environment_actions(policy: ActorCriticPolicy, actions: np.ndarray) -> np.ndarray:

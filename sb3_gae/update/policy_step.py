@@ -72,7 +72,8 @@ class _SurrogateAndDivergence:
                 surrogate = _surrogate(self.advantages, new.log_prob(self.batch.actions), self.old_log_prob)
                 return surrogate.item(), mean_kl(self.old, new).item()
         except ValueError:
-            # torch refuses distribution parameters that are not finite: too long a step, not an error of the user's
+            # torch refuses distribution parameters that are not finite: too long a step, not an error of the user's. Where
+            # `torch.compile` has switched that check off, both are NaN, which the search rejects, too.
             return -math.inf, math.inf
 
 

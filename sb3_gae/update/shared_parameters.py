@@ -115,13 +115,15 @@ class SharedParameters:
             self._start = snapshot(policy.get_distribution(self._observations))
 
     def divergence(self) -> float:
-        """Of the policy as it now is, from the policy as it stood at the beginning."""
+        """Of the policy as it now is, from the policy as it stood at the beginning; infinite where it is not a number."""
         try:
             with th.no_grad():
-                return mean_kl(self._start, self._policy.get_distribution(self._observations)).item()
+                divergence = mean_kl(self._start, self._policy.get_distribution(self._observations)).item()
         except ValueError:
             # torch refuses distribution parameters that are not finite: too long a step
             return math.inf
+        # `torch.compile` has switched that check off for the whole process
+        return math.inf if math.isnan(divergence) else divergence
 
     def radius(self, steps_left: int) -> float:
         """
