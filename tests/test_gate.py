@@ -1,5 +1,6 @@
 """The gate's arithmetic; what it measures is left to `python -m benchmarks.gate`, since tests do not time things."""
 
+import contextlib
 import math
 import sys
 from pathlib import Path
@@ -9,9 +10,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+import benchmarks.gate.__main__ as gate
 from benchmarks.gate.bands import LEARNING_DEVIATIONS, SPEED_MARGIN, Band, learning_band, speed_band, verdicts
 from benchmarks.gate.learning import RUNS, SEEDS
-from benchmarks.gate.plants import PLANTS, twice
+from benchmarks.gate.plants import PLANTS, Plant, twice
 from benchmarks.gate.records import bands, read_records
 from benchmarks.gate.speed import ROLLOUT_TASKS
 
@@ -58,9 +60,31 @@ def test_a_plant_does_the_work_two_times_and_goes_away() -> None:
     calls = []
     assert twice(lambda number: calls.append(number) or number)(3) == 3
     assert calls == [3, 3]
-    for plant, _ in PLANTS.values():
-        with plant() as patched:
+    for plant in PLANTS.values():
+        with plant.fault() as patched:
             assert patched is not None
+
+
+def test_a_fault_is_noticed_by_its_own_numbers_and_where_nothing_else_is_red(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured: dict[str, list[dict[str, float]]] = {}
+
+    def prove_with(*rounds: dict[str, float]) -> bool:
+        measured["speed"] = list(rounds)
+        return gate.prove(["planted"])
+
+    monkeypatch.setattr(gate, "measure", lambda part: measured[part].pop(0))
+    monkeypatch.setattr(gate, "read_records", lambda: {"speed": {"one": [1.0], "other": [1.0]}})
+    monkeypatch.setitem(PLANTS, "planted", Plant(contextlib.nullcontext, "speed", ("one",)))
+    good, red, other_red = {"one": 1.0, "other": 1.0}, {"one": 2.0, "other": 1.0}, {"one": 1.0, "other": 2.0}
+    assert prove_with(good, red)
+    assert not prove_with(good, good)
+    assert not prove_with(good, other_red)
+    assert not prove_with(red, red)
+
+
+def test_every_fault_has_numbers_that_are_recorded() -> None:
+    records = read_records()
+    assert all(set(plant.numbers) <= set(records[plant.part]) and plant.numbers for plant in PLANTS.values())
 
 
 def test_without_a_record_the_gate_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -74,6 +98,6 @@ def test_the_records_cover_what_is_measured_with_seeds_of_their_own() -> None:
     assert set(records["learning"]) == set(RUNS)
     for scores in records["learning"].values():
         assert len(scores) >= 20 and not {int(seed) for seed in scores} & set(SEEDS)
-    assert {f"rollout / physics, {task}" for task in ROLLOUT_TASKS} < set(records["speed"])
+    assert {f"rollout / steps, {task}" for task in ROLLOUT_TASKS} < set(records["speed"])
     assert all(len(ratios) >= 10 for ratios in records["speed"].values())
     assert all(band.low < band.high for part in records if part != "of" for band in bands(records, part, len(SEEDS)).values())

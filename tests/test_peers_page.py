@@ -3,13 +3,14 @@
 import pytest
 
 from benchmarks.peers import report
+from benchmarks.peers.former import marked
 from benchmarks.peers.page import filled
 from benchmarks.peers.table import read_results
 
 
 @pytest.fixture(scope="module")
 def sections() -> dict[str, str]:
-    return report.sections_of(read_results())
+    return report.sections_of(marked(read_results()))
 
 
 @pytest.mark.parametrize("path", report.PAGES)

@@ -1,7 +1,9 @@
 """What is made of the results of the benchmark against peers."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,19 +12,22 @@ from matplotlib import rc_context
 from peers_data import A_PROCESSOR, ENDS, SEEDS, TASKS, a_run, results
 from rliable import metrics
 
-from benchmarks.peers import aggregates, report, tables
+from benchmarks.peers import aggregates, report, tables, targets
 from benchmarks.peers.aggregates import improvement, interquartile_means, normalized, probability_of_improvement, ratio
-from benchmarks.peers.algorithms import OURS, PPO, TRPO
+from benchmarks.peers.algorithms import A2C, ALGORITHMS, OURS, PPO, TRPO
 from benchmarks.peers.comparison import final_scores, mujoco_runs, on_one_processor, scores_after, times_to_reach
 from benchmarks.peers.curves import Run, against_seconds, against_steps, first_reach, runs_of, scores_of
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.figures import draw_all
+from benchmarks.peers.former import marked, notes_on_former
 from benchmarks.peers.journal import Journal, State, journal_path
 from benchmarks.peers.page import filled
 from benchmarks.peers.plan import Cell
-from benchmarks.peers.protocol import EVALUATIONS, MUJOCO_STEPS
+from benchmarks.peers.protocol import EVALUATIONS, MUJOCO_STEPS, MUJOCO_TASKS
+from benchmarks.peers.settings import our_defaults, settings_of
 from benchmarks.peers.table import export, gather, read_results
-from benchmarks.peers.tables import number
+from benchmarks.peers.texts import number
+from benchmarks.peers.variants import CANDIDATES, SHIPPED
 from sb3_gae.sweep.figures.style import STYLE
 from sb3_gae.sweep.statistics import estimate
 
@@ -100,7 +105,7 @@ def test_seconds_of_one_processor_only_are_compared() -> None:
     assert reach.peer_training == pytest.approx(400)
     assert scores_after(runs, 0.05)[TRPO].shape == (2, len(TASKS))
     assert scores_after(runs, 0.05)[OURS].shape == (SEEDS, len(TASKS))
-    assert [row[-2] for row in rows_of(tables.targets_table(table))[:3]] == ["3", "3", "2"]
+    assert [row[-2] for row in rows_of(targets.targets_table(table))[:3]] == ["3", "3", "2"]
 
 
 def test_without_a_processor_in_common_times_are_not_compared() -> None:
@@ -166,20 +171,42 @@ def test_tables_say_what_the_results_say(sections: dict[str, str]) -> None:
     assert rows_of(sections["reach"])[1] == ["Hopper-v5", "2 001", "350 000", "35 s", "200 s", "400 s", "0.09"]
     assert rows_of(sections["clock"])[0][2] == ""
     assert "- processor: a processor" in sections["origin"]
-    assert "each of the processor: 1.50, at most 1.50" in sections["origin"]
+    assert "each of the processor, median over runs: SB3's A2C 1.50, at most 1.50; " in sections["origin"]
 
 
 def test_the_summary_names_the_best_peer_first_and_how_many_runs_there_are(sections: dict[str, str]) -> None:
     assert sections["summary"] == (
-        "Over 2 tasks the interquartile mean of TRPOGAE is 1.50 [1.50, 1.50] times that of TRPO and "
-        "2.00 [2.00, 2.00] times that of PPO. Runs on each task: TRPOGAE 3, TRPO 3, PPO 3."
+        "Over 2 tasks the interquartile mean of TRPOGAE is 1.50 [1.50, 1.50] times that of sb3-contrib's TRPO and "
+        "2.00 [2.00, 2.00] times that of SB3's PPO. Runs on each task: TRPOGAE 3, sb3-contrib's TRPO 3, SB3's PPO 3."
     )
     assert tables.summary(TABLE[TABLE["seed"] < 2]).endswith("**Few runs, so little is said of chance.**")
 
 
 def test_targets_are_met_or_not(sections: dict[str, str]) -> None:
-    found = [row[-2:] for row in rows_of(sections["targets"])]
-    assert found == [["3", "yes"], *[["3", "so far yes"]] * 2, ["3", "so far **no**"], ["3", "so far yes"]]
+    found = [row[-3:] for row in rows_of(sections["targets"])]
+    assert found[:3] == [["2 of 6", "3", "so far yes"]] * 3
+    assert found[3:] == [["1 of 5", "3", "so far **no**"], ["1 of 3", "3", "so far yes"]]
+    assert "without A2C, SB3 and TRPO, tianshou and NPG, tianshou" in rows_of(sections["targets"])[0][1]
+
+
+def test_a_target_is_met_once_all_that_it_is_about_has_been_run() -> None:
+    def first(table: pd.DataFrame) -> list[str]:
+        return rows_of(targets.targets_table(table))[0][-3:]
+
+    whole = pd.concat(
+        [
+            a_run(task, name, seed, MUJOCO_STEPS, end=2000.0 if name == OURS else 1000.0)
+            for task in MUJOCO_TASKS
+            for name in ALGORITHMS
+            for seed in range(SEEDS)
+        ],
+        ignore_index=True,
+    )
+    assert first(whole) == ["6 of 6", "3", "yes"]
+    assert first(whole[whole["seed"] < 2]) == ["6 of 6", "2", "so far yes"]
+    assert first(whole[whole["algorithm"] != A2C]) == ["6 of 6", "3", "so far yes"]
+    assert first(whole[whole["task"] != "Ant-v5"]) == ["5 of 6", "3", "so far yes"]
+    assert first(whole.assign(former=whole["task"] == "Ant-v5")) == ["6 of 6", "3", "so far yes"]
 
 
 def test_what_trpo_does_not_learn_is_no_target() -> None:
@@ -190,7 +217,10 @@ def test_what_trpo_does_not_learn_is_no_target() -> None:
     assert not reach.is_learned
     assert rows_of(tables.reach_table(table))[1] == ["Hopper-v5", "999", "", "", "", "", "TRPO ends no higher than it begins"]
     # Reached at once, and yet not what the target asks for
-    assert "on all" in rows_of(tables.targets_table(table))[2]
+    assert "on all 1 that it learns" in rows_of(targets.targets_table(table))[2]
+    falls = table["algorithm"] == TRPO
+    table.loc[falls, "mean_return"] = 3000.0 - TABLE.loc[falls, "mean_return"]
+    assert rows_of(targets.targets_table(table))[2][1::3] == ["it learns none", "so far **no**"]
 
 
 def test_one_or_two_runs_have_no_interval() -> None:
@@ -233,9 +263,9 @@ def test_the_page_keeps_what_is_not_between_markers() -> None:
 
 
 def test_export_keeps_runs_that_are_not_here(tmp_path: Path) -> None:
-    def run(cell: Cell, value: float, status: State = State.DONE) -> None:
+    def run(cell: Cell, value: float, status: State = State.DONE, begun: int = 0) -> None:
         journal = Journal(journal_path(tmp_path / "logs", cell))
-        start = {"cell": list(cell), "settings": {"gamma": 1}, "settings_hash": "abc", "origin": {"torch": "2"}, "time": 0}
+        start = {"cell": list(cell), "settings": {"gamma": 1}, "origin": {"torch": "2"}, "time": begun}
         journal.begin(start)
         journal.evaluated({"steps": 0, "mean_return": value, "wall_seconds": 0.0})
         journal.evaluated({"steps": 1000, "mean_return": value, "wall_seconds": 1.0})
@@ -248,11 +278,17 @@ def test_export_keeps_runs_that_are_not_here(tmp_path: Path) -> None:
     run(cell._replace(seed=2), 3.0, State.FAILED)
     table, failures = gather(tmp_path / "logs")
     assert failures == [f"{cell._replace(seed=2).name}: a reason"]
-    (path,) = export(table, tmp_path)
-    assert path.name == "Hopper-v5.parquet"
+    exported = export(table, tmp_path)
+    assert [path.name for path in exported.paths] == ["Hopper-v5.parquet"] and exported.notes == []
     journal_path(tmp_path / "logs", cell).unlink()
-    run(cell._replace(seed=1), 5.0)
-    export(gather(tmp_path / "logs")[0], tmp_path)
+    run(cell._replace(seed=1), 5.0, begun=1)
+    assert export(gather(tmp_path / "logs")[0], tmp_path).notes == [
+        "replaced by a run that was begun later: Hopper-v5_trpo_gae_1000_seed1"
+    ]
+    run(cell._replace(seed=1), 6.0)
+    assert export(gather(tmp_path / "logs")[0], tmp_path).notes == [
+        "not exported, since the file has a run that was begun later: Hopper-v5_trpo_gae_1000_seed1"
+    ]
     stored = read_results(tmp_path)
     assert list(stored["seed"]) == [0, 0, 1, 1]
     assert list(stored["mean_return"]) == [1.0, 1.0, 5.0, 5.0]
@@ -269,6 +305,7 @@ def test_a_report_without_results_says_so(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_a_report_is_a_page_and_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     few = pd.concat([a_run("Hopper-v5", name, seed, MUJOCO_STEPS) for name in (OURS, TRPO) for seed in (0, 1)])
+    few["settings"] = json.dumps(settings_of(Cell("Hopper-v5", OURS, "", 0, MUJOCO_STEPS)) | {"gamma": 0.5})
     monkeypatch.setattr(report, "read_results", lambda: few)
     (tmp_path / "docs").mkdir()
     for path in report.PAGES:
@@ -276,5 +313,46 @@ def test_a_report_is_a_page_and_figures(tmp_path: Path, monkeypatch: pytest.Monk
     written = report.write_report(tmp_path)
     page = (tmp_path / "docs" / "benchmarks.md").read_text()
     assert "![Return against steps on each task](images/peers_steps.svg)" in page
-    assert {path.name for path in written} >= {"benchmarks.md", "tuning.md", "README.md", "peers_steps.svg"}
-    assert all(path.stat().st_size > 0 for path in written)
+    assert {path.name for path in written.paths} >= {"benchmarks.md", "tuning.md", "README.md", "peers_steps.svg"}
+    assert all(path.stat().st_size > 0 for path in written.paths)
+    assert written.notes == ["Hopper-v5_trpo_gae_1000000: 2 of 2 runs are of settings that are no longer shipped; marked"]
+    assert "| 3 000 (2 runs) † |" in page and "† Of settings that are no longer shipped." in page
+    assert "Ours on Hopper-v5 are of settings that are no longer shipped." in page
+
+
+def test_runs_of_former_settings_do_not_mix_with_those_of_today() -> None:
+    def runs(algorithm: str, seeds: range, variant: str, **changes: Any) -> pd.DataFrame:
+        table = pd.concat([a_run("Hopper-v5", algorithm, seed, MUJOCO_STEPS, variant) for seed in seeds])
+        settings = settings_of(Cell("Hopper-v5", algorithm, variant, 0, MUJOCO_STEPS)) | changes
+        return table.drop(columns="former").assign(settings=json.dumps(settings))
+
+    table = pd.concat(
+        [
+            runs(OURS, range(2), SHIPPED, normalize_value=our_defaults()["normalize_value"]),
+            runs(OURS, range(2, 5), SHIPPED, gamma=0.5),
+            runs(OURS, range(1), "adam", gamma=0.5),
+            runs(OURS, range(1), next(iter(CANDIDATES)), gamma=0.5),
+            runs(TRPO, range(1), SHIPPED, gamma=0.5),
+        ]
+    )
+    found = marked(table).groupby(["algorithm", "variant", "seed"])["former"].first()
+    assert found.to_dict() == {
+        (OURS, SHIPPED, 0): False,
+        (OURS, SHIPPED, 1): False,
+        (OURS, "adam", 0): True,
+        (OURS, next(iter(CANDIDATES)), 0): False,
+        (TRPO, SHIPPED, 0): False,
+    }
+    assert notes_on_former(table) == [
+        "Hopper-v5_trpo_gae_1000000: 3 of 5 runs are of settings that are no longer shipped; left out",
+        "Hopper-v5_trpo_gae.adam_1000000: 1 of 1 runs are of settings that are no longer shipped; marked",
+    ]
+
+
+def test_of_two_processors_with_as_many_pairs_that_with_more_runs_is_compared() -> None:
+    table = TABLE[TABLE["algorithm"].isin([OURS, TRPO]) & (TABLE["steps"] == MUJOCO_STEPS)].copy()
+    elsewhere = ((table["seed"] == 0) & (table["algorithm"] == TRPO)) | (table["seed"] < 2) & (table["algorithm"] == OURS)
+    table.loc[elsewhere, "processor"] = "z"
+    table = table[~((table["seed"] == 2) & (table["algorithm"] == TRPO))]
+    timed = on_one_processor(mujoco_runs(table))["Hopper-v5"]
+    assert {name: [run.seed for run in runs] for name, runs in timed.items()} == {OURS: [0, 1], TRPO: [0]}

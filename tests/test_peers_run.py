@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -22,11 +23,13 @@ from benchmarks.peers.plan import PRESETS, Cell
 from benchmarks.peers.pool import Options, Pool, check_libraries, cores_for
 from benchmarks.peers.progress import Bar, left_of, standings, summary
 from benchmarks.peers.recorder import Recorder
-from benchmarks.peers.settings import hash_of, settings_of
+from benchmarks.peers.settings import described, settings_of
 from benchmarks.peers.table import read_results
 
 CELL = Cell("CartPole-v1", OURS, "", 0, 4_000)
-START: dict[str, Any] = {"cell": list(CELL), "settings_hash": "abc", "origin": {"commit": "first", "torch": "2"}}
+SETTINGS = described(OURS, settings_of(CELL))
+START: dict[str, Any] = {"cell": list(CELL), "settings": settings_of(CELL), "origin": {"commit": "first", "torch": "2"}}
+FORMER = START | {"settings": settings_of(CELL) | {"gamma": 0.5}}
 OTHER_COMMIT = START | {"origin": {"commit": "second", "torch": "2"}}
 
 
@@ -68,27 +71,39 @@ def test_an_evaluation_is_due_at_multiples_of_the_interval() -> None:
 
 def test_states_of_a_run(tmp_path: Path) -> None:
     path = journal_path(tmp_path, CELL)
-    assert read_record(path).state("abc") == State.NEW
+    assert read_record(path).state(SETTINGS) == State.NEW
     journal = Journal(path)
     with pytest.raises(BusyError, match="another process"):
         Journal(path)
     journal.begin(START)
     journal.evaluated({"steps": 100})
-    assert (read_record(path).state("abc"), read_record(path).steps) == (State.UNFINISHED, 100)
+    assert (read_record(path).state(SETTINGS), read_record(path).steps) == (State.UNFINISHED, 100)
     journal.end(State.FAILED, "why")
-    assert read_record(path).state("abc") == State.FAILED
+    assert read_record(path).state(SETTINGS) == State.FAILED
     journal.begin(START, [{"kind": "evaluation", "steps": 100}])
     assert read_record(path).evaluations == [{"kind": "evaluation", "steps": 100}]
     journal.end(State.DONE)
     journal.close()
-    assert read_record(path).state("abc") == State.DONE
-    assert read_record(path).state("other settings") == State.STALE
+    assert read_record(path).state(SETTINGS) == State.DONE
+    assert read_record(path).state(described(OURS, FORMER["settings"])) == State.STALE
+
+
+def test_to_spell_out_a_default_changes_no_settings() -> None:
+    settings = settings_of(CELL)
+    assert "normalize_value" not in settings
+    assert described(OURS, settings | {"normalize_value": True}) == described(OURS, settings)
+    assert described(OURS, settings | {"normalize_value": False}) != described(OURS, settings)
 
 
 def test_a_line_that_was_cut_off_does_not_count(tmp_path: Path) -> None:
     path = tmp_path / "run.jsonl"
     path.write_text(json.dumps({"kind": "start", **START}) + '\n{"kind": "evaluation", "ste')
     assert read_record(path) == Record({"kind": "start", **START}, [], None)
+    # Nor does it spoil the line that comes after it
+    journal = Journal(path)
+    journal.end(State.FAILED, "disk full")
+    journal.close()
+    assert read_record(path).end == {"kind": "end", "status": "failed", "reason": "disk full"}
 
 
 def test_a_run_goes_on_from_its_checkpoint() -> None:
@@ -105,7 +120,7 @@ def test_a_run_goes_on_from_its_checkpoint() -> None:
     [
         (None, Checkpoint(Path("a.zip"), 200)),
         (START, None),
-        (START | {"settings_hash": "other"}, Checkpoint(Path("a.zip"), 200)),
+        (FORMER, Checkpoint(Path("a.zip"), 200)),
         (START | {"origin": {"commit": "first", "torch": "3"}}, Checkpoint(Path("a.zip"), 200)),
     ],
 )
@@ -114,27 +129,29 @@ def test_a_run_begins_anew(before: dict[str, Any] | None, checkpoint: Checkpoint
 
 
 def test_what_is_left_to_run(tmp_path: Path) -> None:
-    cells = [CELL._replace(seed=seed) for seed in range(5)]
-    for cell, status, settings_hash in [
-        (cells[1], State.DONE, hash_of(settings_of(CELL))),
-        (cells[2], State.FAILED, hash_of(settings_of(CELL))),
-        (cells[3], State.DONE, "old"),
+    cells = [CELL._replace(seed=seed) for seed in range(7)]
+    for cell, status, start in [
+        (cells[1], State.DONE, START),
+        (cells[2], State.FAILED, START),
+        (cells[3], State.DONE, FORMER),
     ]:
         journal = Journal(journal_path(tmp_path, cell))
-        journal.begin(START | {"settings_hash": settings_hash})
+        journal.begin(start)
         journal.end(status, "a reason")
         journal.close()
     journal = Journal(journal_path(tmp_path, cells[4]))
     journal.begin(START)
     journal.close()
-    table = standings(cells, tmp_path)
-    assert left_of(table) == [cells[0], cells[4]]
-    assert left_of(table, [State.FAILED, State.STALE]) == [cells[0], *cells[2:]]
+    committed = {cells[4]: SETTINGS, cells[5]: SETTINGS, cells[6]: described(OURS, FORMER["settings"])}
+    table = standings(cells, tmp_path, committed)
+    assert left_of(table) == [cells[0], cells[4], cells[6]]
+    assert left_of(table, [State.FAILED, State.STALE]) == [cells[0], *cells[2:5], cells[6]]
+    assert left_of(table, [State.COMMITTED]) == [cells[0], *cells[4:]]
     speeds = {("CartPole-v1", OURS): 1.0, ("CartPole-v1", "evaluation"): 1e9}
     text = summary(table, left_of(table), speeds, jobs=2)
-    assert "5 runs: 1 new, 1 unfinished, 1 done, 1 failed, 1 stale" in text
+    assert "7 runs: 2 new, 1 unfinished, 1 done, 1 failed, 1 stale, 1 committed" in text
     assert f"failed: {cells[2].name}: a reason" in text
-    assert "2 runs left, about 2.2 core-hours, 1.1 hours with 2 side by side" in text
+    assert "3 runs left, about 3.3 core-hours, 1.7 hours with 2 side by side" in text
 
 
 def test_the_bar_counts_what_has_ended_before_only_when_it_is_run_again(tmp_path: Path) -> None:
@@ -174,10 +191,32 @@ def test_a_run_that_is_killed_is_recorded_and_the_rest_goes_on(tmp_path: Path, m
     }
 
 
+def test_a_rerun_that_is_killed_at_once_is_said_and_leaves_the_run_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    journal = Journal(journal_path(tmp_path, CELL))
+    journal.begin(FORMER)
+    journal.end(State.DONE)
+    journal.close()
+    before = read_record(journal_path(tmp_path, CELL))
+    monkeypatch.setattr("benchmarks.peers.pool.command_of", lambda *args: ["sh", "-c", "kill -9 $$"])
+    assert Pool([CELL], Options(tmp_path, 1, False, {}), lambda: None).run() == [f"{CELL.name}: killed by SIGKILL"]
+    assert read_record(journal_path(tmp_path, CELL)) == before
+
+
+def test_a_run_that_was_stopped_together_with_the_command_has_not_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a scheduler stops a whole job."""
+    stop_both = f"kill -TERM {os.getpid()} && kill -TERM $$"
+    monkeypatch.setattr("benchmarks.peers.pool.command_of", lambda *args: ["sh", "-c", stop_both])
+    problems = Pool([CELL], Options(tmp_path, 1, False, {}), lambda: None).run()
+    assert problems == ["stopped by SIGTERM; the same command goes on from here"]
+    assert read_record(journal_path(tmp_path, CELL)).end is None
+
+
 def test_wrong_options_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = Options(tmp_path, 1, True, {})
-    with pytest.raises(PeersError, match="`jobs` must be at least 1, got 0"):
-        cores_for(options._replace(jobs=0))
     with pytest.raises(PeersError, match=r"`jobs` must be at most \d+, the number of cores, got 10000"):
         cores_for(options._replace(jobs=10_000))
     with pytest.raises(PeersError, match=r"is not installed for .*--algorithms trpo"):
@@ -185,6 +224,8 @@ def test_wrong_options_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[s
         check_libraries([without, CELL._replace(algorithm=TRPO)], options._replace(pythons={"tianshou": "false"}))
     assert main(["status", "--preset", "smoke", "--seeds", "7"]) == 2
     assert "`seeds`: the preset has no 7; it has 0." in capsys.readouterr().err
+    assert main(["status", "--preset", "smoke", "--jobs", "0"]) == 2
+    assert "`jobs` must be at least 1, got 0" in capsys.readouterr().err
 
 
 def test_a_run_of_ours_that_fails_goes_on_as_if_it_had_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,26 +258,26 @@ def test_a_run_of_ours_that_fails_goes_on_as_if_it_had_not(tmp_path: Path, monke
     assert seconds == sorted(seconds) and seconds[0] < seconds[1]
 
 
-def test_the_command_runs_exports_and_has_nothing_left(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    command = ["run", "--preset", "smoke", "--logs", str(tmp_path / "logs"), "--jobs", "2", "--no-pin"]
+def test_the_command_runs_exports_and_has_nothing_left(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    places = ["--logs", str(tmp_path / "logs"), "--results", str(tmp_path / "results")]
+    command = ["run", "--preset", "smoke", *places, "--jobs", "2", "--no-pin"]
     assert main([*command, "--dry-run"]) == 0
     assert "2 runs left" in capsys.readouterr().out
     assert not (tmp_path / "logs").exists()
     assert main(command) == 0
     records = [read_record(journal_path(tmp_path / "logs", cell)) for cell in PRESETS["smoke"]]
-    assert [record.state(hash_of(settings_of(cell))) for cell, record in zip(PRESETS["smoke"], records, strict=True)] == [
-        State.DONE,
-        State.DONE,
-    ]
+    today = [described(cell.algorithm, settings_of(cell)) for cell in PRESETS["smoke"]]
+    assert [record.state(settings) for record, settings in zip(records, today, strict=True)] == [State.DONE, State.DONE]
     assert all([line["steps"] for line in record.evaluations] == [0, 1024, 2048] for record in records)
     capsys.readouterr()
     assert main(command) == 0
     assert "2 runs: 2 done" in capsys.readouterr().out
 
-    monkeypatch.setattr("benchmarks.peers.table.export.__defaults__", (tmp_path / "results",))
-    assert main(["export", "--logs", str(tmp_path / "logs")]) == 0
+    assert main(["export", *places]) == 0
+    shutil.rmtree(tmp_path / "logs")
+    capsys.readouterr()
+    assert main(command) == 0
+    assert "2 runs: 2 committed" in capsys.readouterr().out
     table = read_results(tmp_path / "results")
     assert len(table) == 6
     assert set(table["algorithm"]) == {OURS, TRPO}

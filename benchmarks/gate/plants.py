@@ -2,9 +2,10 @@
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, NamedTuple
 from unittest import mock
 
+from benchmarks.gate.learning import RUNS
 from sb3_gae import TRPOGAE, GAERolloutBuffer
 from sb3_gae.rollout.collection import ActionSampler
 from sb3_gae.update import trust_region
@@ -55,10 +56,22 @@ def value_first() -> AbstractContextManager[Any]:
     return mock.patch.object(TRPOGAE, "train", in_the_other_order)
 
 
-#: by name, with the parts of the gate that ought to notice
-PLANTS: dict[str, tuple[Callable[[], AbstractContextManager[Any]], str]] = {
-    "doubled-cg": (doubled_conjugate_gradient, "speed"),
-    "doubled-actions": (doubled_actions, "speed"),
-    "wrong-sign": (wrong_sign, "learning"),
-    "value-first": (value_first, "learning"),
+class Plant(NamedTuple):
+    """
+    :param fault: in force within the ``with`` statement of what it returns
+    :param part: of the gate
+    :param numbers: of the part that have to turn red; others may
+    """
+
+    fault: Callable[[], AbstractContextManager[Any]]
+    part: str
+    numbers: tuple[str, ...]
+
+
+#: by name
+PLANTS = {
+    "doubled-cg": Plant(doubled_conjugate_gradient, "speed", ("update / sb3-contrib's", "value fit / passes")),
+    "doubled-actions": Plant(doubled_actions, "speed", ("actions / policy's own",)),
+    "wrong-sign": Plant(wrong_sign, "learning", tuple(RUNS)),
+    "value-first": Plant(value_first, "learning", ("HalfCheetah-v5, close fit",)),
 }

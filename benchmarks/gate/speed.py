@@ -31,7 +31,7 @@ def speed_ratios() -> dict[str, float]:
     return (
         update_ratios()
         | {"actions / policy's own": actions_ratio()}
-        | {f"rollout / physics, {task}": rollout_ratio(task) for task in ROLLOUT_TASKS}
+        | {f"rollout / steps, {task}": rollout_ratio(task) for task in ROLLOUT_TASKS}
     )
 
 
@@ -77,10 +77,10 @@ def rollout_ratio(task: str) -> float:
     times = least_seconds(
         {
             "rollout": (lambda: model.collect_rollouts(model.env, callback, model.rollout_buffer, N_STEPS), None),
-            "physics": (lambda: [env.step(action) for action in actions], None),
+            "steps": (lambda: [env.step(action) for action in actions], None),
         }
     )
-    return times["rollout"] / times["physics"]
+    return times["rollout"] / times["steps"]
 
 
 def actions_ratio() -> float:

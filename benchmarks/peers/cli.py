@@ -9,13 +9,17 @@ import benchmarks.peers as package
 from benchmarks.peers.cost import SPEEDS, read_speeds
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.journal import State
+from benchmarks.peers.places import RESULTS
 from benchmarks.peers.plan import PRESETS, Cell, cells_of
 from benchmarks.peers.pool import Options, Pool, check_libraries
-from benchmarks.peers.progress import Bar, left_of, standings, summary
+from benchmarks.peers.progress import Bar, Standing, left_of, standings, summary
 from benchmarks.peers.protocol import CLASSIC_TASKS, MUJOCO_TASKS
 
 #: all that the page of results has
 DEFAULT_PRESETS = ("classic", "mujoco", "mujoco-3m", "ablation")
+
+#: states of runs that are not run again unless that is asked for
+_AGAIN = (State.FAILED, State.STALE, State.COMMITTED)
 
 #: of the environment that `make bench-full` makes
 TIANSHOU_PYTHON = ".venv-tianshou/bin/python"
@@ -41,6 +45,7 @@ def _parser() -> argparse.ArgumentParser:
     verbs = parser.add_subparsers(required=True, metavar="VERB")
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument("--logs", type=Path, default=Path("logs/peers"), help="folder of all runs (%(default)s)")
+    shared.add_argument("--results", type=Path, default=RESULTS, help="folder of the committed files (%(default)s)")
     plan = argparse.ArgumentParser(add_help=False, parents=[shared])
     plan.add_argument("--preset", nargs="+", choices=list(PRESETS), default=list(DEFAULT_PRESETS), help="(%(default)s)")
     plan.add_argument("--tasks", nargs="+", help="only these")
@@ -51,9 +56,7 @@ def _parser() -> argparse.ArgumentParser:
 
     run = verbs.add_parser("run", parents=[plan], help="run what is left")
     run.add_argument("--dry-run", action="store_true", help="only say what is left and how long it takes")
-    run.add_argument(
-        "--again", nargs="+", choices=[str(State.FAILED), str(State.STALE)], default=[], help="also runs that are that"
-    )
+    run.add_argument("--again", nargs="+", choices=list(map(str, _AGAIN)), default=[], help="also runs that are that")
     run.add_argument("--no-pin", action="store_true", help="do not keep runs to a core each")
     run.add_argument(
         "--tianshou-python",
@@ -73,6 +76,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _chosen(args: argparse.Namespace) -> list[Cell]:
+    if args.jobs < 1:
+        raise PeersError(f"`jobs` must be at least 1, got {args.jobs}.")
     wanted = {"task": args.tasks, "algorithm": args.algorithms, "variant": args.variants, "seed": args.seeds}
     cells = cells_of(args.preset)
     for name, values in wanted.items():
@@ -85,9 +90,15 @@ def _chosen(args: argparse.Namespace) -> list[Cell]:
     return cells
 
 
+def _standings(args: argparse.Namespace) -> list[Standing]:
+    # The help need not wait for pandas
+    from benchmarks.peers.table import committed_settings
+
+    return standings(_chosen(args), args.logs, committed_settings(args.results))
+
+
 def _run(args: argparse.Namespace) -> int:
-    cells = _chosen(args)
-    table = standings(cells, args.logs)
+    table = _standings(args)
     left = left_of(table, [State(name) for name in args.again])
     print(summary(table, left, read_speeds(), args.jobs), flush=True)
     if args.dry_run or not left:
@@ -105,7 +116,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _status(args: argparse.Namespace) -> int:
-    table = standings(_chosen(args), args.logs)
+    table = _standings(args)
     for one in table:
         print(f"{one.state:<10} {min(one.record.steps, one.cell.steps):>9} of {one.cell.steps:>9} steps  {one.cell.name}")
     print(summary(table, left_of(table), read_speeds(), args.jobs))
@@ -118,16 +129,16 @@ def _export(args: argparse.Namespace) -> int:
     table, failures = gather(args.logs)
     for failure in failures:
         print(f"not exported, since it failed: {failure}", file=sys.stderr)
-    for path in export(table):
-        print(f"wrote {path}")
+    exported = export(table, args.results)
+    print("\n".join([*exported.notes, *(f"wrote {path}" for path in exported.paths)]))
     return 0
 
 
 def _report(args: argparse.Namespace) -> int:
     from benchmarks.peers.report import write_report
 
-    for path in write_report():
-        print(f"wrote {path}")
+    written = write_report()
+    print("\n".join([*written.notes, *(f"wrote {path}" for path in written.paths)]))
     return 0
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.peers.algorithms import ALGORITHMS
+from benchmarks.peers.former import FORMER
 from benchmarks.peers.protocol import EVALUATIONS, SCORED_PART
 from benchmarks.peers.variants import SHIPPED
 
@@ -16,10 +17,11 @@ class Run(NamedTuple):
 
     :param seed: of the training
     :param steps: of training until then
-    :param seconds: of training until then, of the processor: one thread on a core of its own, so that nothing else on the
-        machine counts
+    :param seconds: of training until then, of the processor: one thread on a core of its own, so that waiting for it does not
+        count; what else runs on the machine still takes of its caches and its clock rate
     :param returns: mean over the episodes
     :param processor: that it ran on; seconds of one say nothing beside those of another
+    :param is_former: whether its settings are no longer the shipped ones
     """
 
     seed: int
@@ -27,6 +29,7 @@ class Run(NamedTuple):
     seconds: np.ndarray
     returns: np.ndarray
     processor: str
+    is_former: bool = False
 
     @property
     def score(self) -> float:
@@ -52,7 +55,7 @@ def runs_of(table: pd.DataFrame, task: str, algorithm: str, steps: int, variant:
 
 def _run(seed: int, rows: pd.DataFrame) -> Run:
     steps, seconds, returns = (rows[name].to_numpy(float) for name in ("step", "cpu_seconds", "mean_return"))
-    return Run(seed, steps, seconds, returns, rows["processor"].iloc[-1])
+    return Run(seed, steps, seconds, returns, rows["processor"].iloc[-1], bool(rows[FORMER].iloc[-1]))
 
 
 def all_runs(table: pd.DataFrame, task: str, steps: int) -> dict[str, list[Run]]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.peers.plan import Cell
+from benchmarks.peers.settings import described
 
 Line = dict[str, Any]
 
@@ -21,6 +22,15 @@ class State(StrEnum):
     DONE = "done"
     FAILED = "failed"
     STALE = "stale"  # done, but with settings that are not today's
+    COMMITTED = "committed"  # not here, but its results are in the committed files, with today's settings
+
+
+def described_in(start: Line) -> str:
+    """
+    :param start: the line of a run's beginning
+    :return: its settings, see :func:`~benchmarks.peers.settings.described`
+    """
+    return described(Cell(*start["cell"]).algorithm, start["settings"])
 
 
 class Record(NamedTuple):
@@ -41,9 +51,9 @@ class Record(NamedTuple):
         """Of training, as far as is known."""
         return int(self.evaluations[-1]["steps"]) if self.evaluations else 0
 
-    def state(self, settings_hash: str) -> State:
+    def state(self, settings: str) -> State:
         """
-        :param settings_hash: of today's settings
+        :param settings: today's, as :func:`~benchmarks.peers.settings.described` has them
         :return: where the run stands
         """
         if self.start is None:
@@ -52,7 +62,7 @@ class Record(NamedTuple):
             return State.UNFINISHED
         if self.end["status"] == State.FAILED:
             return State.FAILED
-        return State.DONE if self.start["settings_hash"] == settings_hash else State.STALE
+        return State.DONE if described_in(self.start) == settings else State.STALE
 
 
 def journal_path(logs: Path, cell: Cell) -> Path:
@@ -84,6 +94,14 @@ def _whole_lines(text: str) -> list[Line]:
     return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
 
 
+def _cut_torn_line(path: Path) -> None:
+    """What is added after a line that was cut off would be read as a part of it."""
+    content = path.read_bytes()
+    whole = content.rfind(b"\n") + 1
+    if whole < len(content):
+        os.truncate(path, whole)
+
+
 class BusyError(Exception):
     """Another process writes the file."""
 
@@ -105,6 +123,7 @@ class Journal:
         except BlockingIOError:
             self._file.close()
             raise BusyError(f"{path} is being written by another process.") from None
+        _cut_torn_line(path)
 
     def begin(self, start: Line, evaluations: Iterable[Line] = ()) -> None:
         """

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from benchmarks.peers.algorithms import ALGORITHMS, MODULES
 from benchmarks.peers.errors import PeersError
-from benchmarks.peers.journal import BusyError, Journal, State, journal_path, read_record
+from benchmarks.peers.journal import BusyError, Journal, Record, State, journal_path, read_record
 from benchmarks.peers.plan import Cell
 from benchmarks.peers.worker import BUSY, command_of
 
@@ -41,8 +41,6 @@ def cores_for(options: Options) -> list[int | None]:
     :return: for each job the core that it is kept to, None if to none
     :raises PeersError: if there are more jobs than cores
     """
-    if options.jobs < 1:
-        raise PeersError(f"`jobs` must be at least 1, got {options.jobs}.")
     if not options.pin or not hasattr(os, "sched_getaffinity"):
         return [None] * options.jobs
     cores = sorted(os.sched_getaffinity(0))
@@ -96,7 +94,9 @@ class Pool:
                 while self._waiting and self._free:
                     self._start(self._waiting.popleft())
                 time.sleep(_LOOK_EVERY)
-                failures += self._look()
+                # What the same signal has ended has not failed
+                if not self._stop:
+                    failures += self._look()
                 self._show()
         finally:
             self._end()
@@ -113,7 +113,9 @@ class Pool:
         # One thread a run: runs side by side would otherwise wait for each other's
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         self._options.logs.mkdir(parents=True, exist_ok=True)
-        with journal_path(self._options.logs, cell).with_suffix(".txt").open("w") as output:
+        path = journal_path(self._options.logs, cell)
+        before = read_record(path)
+        with path.with_suffix(".txt").open("w") as output:
             process = subprocess.Popen(
                 command_of(cell, self._options.logs, core, python),
                 env=environment,
@@ -122,7 +124,7 @@ class Pool:
                 # Ctrl-C is for this process, which passes it on once
                 process_group=0,
             )
-        self._running.append(_Run(cell, core, process))
+        self._running.append(_Run(cell, core, process, before))
 
     def _look(self) -> list[str]:
         """:return: a line for each run that has just failed"""
@@ -137,8 +139,12 @@ class Pool:
         if status == BUSY:
             return "another process has this run"
         record = read_record(path)
-        if record.end is None:
+        has_begun = record != run.before
+        if record.end is None or (status != 0 and not has_begun):
             reason = f"killed by {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+            if record.end is not None:
+                # Of the run before, which this one was to replace
+                return reason
             try:
                 journal = Journal(path)
             except BusyError:
@@ -164,3 +170,4 @@ class _Run(NamedTuple):
     cell: Cell
     core: int | None
     process: subprocess.Popen[bytes]
+    before: Record

@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from tqdm import tqdm
 from benchmarks.peers.cost import Speeds, cost_of
 from benchmarks.peers.journal import Record, State, journal_path, read_record
 from benchmarks.peers.plan import Cell
-from benchmarks.peers.settings import hash_of, settings_of
+from benchmarks.peers.settings import described, settings_of
 
 
 class Standing(NamedTuple):
@@ -26,17 +26,23 @@ class Standing(NamedTuple):
     state: State
 
 
-def standings(cells: Sequence[Cell], logs: Path) -> list[Standing]:
+def standings(cells: Sequence[Cell], logs: Path, committed: Mapping[Cell, str]) -> list[Standing]:
     """
     :param cells: of the plan
     :param logs: folder of all runs
+    :param committed: settings of the runs whose results are committed, see :func:`~benchmarks.peers.table.committed_settings`
     :return: where each stands
     """
-    found = []
-    for cell in cells:
-        record = read_record(journal_path(logs, cell))
-        found.append(Standing(cell, record, record.state(hash_of(settings_of(cell)))))
-    return found
+    return [_standing(cell, read_record(journal_path(logs, cell)), committed) for cell in cells]
+
+
+def _standing(cell: Cell, record: Record, committed: Mapping[Cell, str]) -> Standing:
+    settings = described(cell.algorithm, settings_of(cell))
+    state = record.state(settings)
+    # What has begun here, and may be one of the seeds that others run as well, goes on
+    if state not in (State.DONE, State.UNFINISHED) and committed.get(cell) == settings:
+        state = State.COMMITTED
+    return Standing(cell, record, state)
 
 
 def left_of(table: Sequence[Standing], again: Sequence[State] = ()) -> list[Cell]:
@@ -62,7 +68,7 @@ def summary(table: Sequence[Standing], left: Sequence[Cell], speeds: Speeds, job
         if one.state == State.FAILED and one.record.end is not None:
             lines.append(f"  failed: {one.cell.name}: {one.record.end['reason']}")
         elif one.state == State.STALE:
-            lines.append(f"  stale: {one.cell.name} was run with other settings; run it again with --again stale")
+            lines.append(f"  stale: {one.cell.name} was run with other settings than today's; run it again with --again stale")
     if left:
         runs = [(one.cell, one.record) for one in table if one.state == State.DONE]
         hours = {cell: cost_of(cell, speeds, runs) / 3600 for cell in left}

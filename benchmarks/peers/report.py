@@ -2,20 +2,21 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 
-from benchmarks.peers import tables
+from benchmarks.peers import tables, targets, tuning_tables
 from benchmarks.peers.errors import PeersError
+from benchmarks.peers.former import marked, notes_on_former
 from benchmarks.peers.page import filled
+from benchmarks.peers.places import ROOT
 from benchmarks.peers.shipped import shipped_table
 from benchmarks.peers.table import read_results
 
-ROOT = Path(__file__).parents[2]
-
 _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "summary": tables.summary,
-    "targets": tables.targets_table,
+    "targets": targets.targets_table,
     "scores": tables.scores_table,
     "over tasks": tables.aggregate_table,
     "clock": tables.clock_table,
@@ -23,12 +24,12 @@ _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
     "classic": tables.classic_table,
     "three million": tables.long_table,
     "ablation": tables.ablation_table,
-    "tuning": tables.tuning_table,
-    "tuning long": tables.long_tuning_table,
-    "tuning pendulum": tables.pendulum_tuning_table,
-    "tuning swimmer": tables.swimmer_tuning_table,
-    "tuning humanoid": tables.humanoid_tuning_table,
-    "tuning damping": tables.damping_tuning_table,
+    "tuning": tuning_tables.tuning_table,
+    "tuning long": tuning_tables.long_tuning_table,
+    "tuning pendulum": tuning_tables.pendulum_tuning_table,
+    "tuning swimmer": tuning_tables.swimmer_tuning_table,
+    "tuning humanoid": tuning_tables.humanoid_tuning_table,
+    "tuning damping": tuning_tables.damping_tuning_table,
     "origin": tables.origin_list,
 }
 #: preset that makes what a section needs, of those that would leave a chapter empty without
@@ -57,7 +58,7 @@ PAGES = {
 
 def sections_of(table: pd.DataFrame) -> dict[str, str]:
     """
-    :param table: of results
+    :param table: of results, see :func:`~benchmarks.peers.former.marked`
     :return: Markdown by the name of the section
     """
     has_figures = bool(tables.reach_table(table))
@@ -68,10 +69,20 @@ def sections_of(table: pd.DataFrame) -> dict[str, str]:
     return made | drawn
 
 
-def write_report(root: Path = ROOT) -> list[Path]:
+class Written(NamedTuple):
+    """
+    :param paths: of pages and figures
+    :param notes: a line for each training with runs of settings that are no longer shipped
+    """
+
+    paths: list[Path]
+    notes: list[str]
+
+
+def write_report(root: Path = ROOT) -> Written:
     """
     :param root: of the repository, where :data:`PAGES` are filled and figures drawn
-    :return: paths of what was written
+    :return: what was done
     :raises PeersError: if there are no results
     """
     table = read_results()
@@ -84,6 +95,7 @@ def write_report(root: Path = ROOT) -> list[Path]:
     from sb3_gae.sweep.figures.files import save_figure
     from sb3_gae.sweep.figures.style import STYLE
 
+    notes, table = notes_on_former(table), marked(table)
     sections = sections_of(table)
     written = []
     for path, names in PAGES.items():
@@ -96,4 +108,4 @@ def write_report(root: Path = ROOT) -> list[Path]:
         for name, figure in draw_all(table).items():
             save_figure(figure, images / f"{name}.svg")
             written.append(images / f"{name}.svg")
-    return written
+    return Written(written, notes)

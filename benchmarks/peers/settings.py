@@ -1,7 +1,8 @@
 """The settings of each run, from the files that their owners tuned and published."""
 
-import hashlib
+import functools
 import importlib.util
+import inspect
 import json
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,12 @@ import yaml
 
 from benchmarks.peers.algorithms import ALGORITHMS, OURS
 from benchmarks.peers.errors import PeersError
+from benchmarks.peers.places import ROOT
 from benchmarks.peers.plan import Cell
 from benchmarks.peers.tianshou_settings import TIANSHOU_SETTINGS
 from benchmarks.peers.variants import EVERY_VARIANT
 
-_OUR_FILE = Path(__file__).parents[2] / "hyperparams" / "trpo_gae.yml"
+_OUR_FILE = ROOT / "hyperparams" / "trpo_gae.yml"
 
 
 def settings_of(cell: Cell) -> dict[str, Any]:
@@ -58,9 +60,22 @@ def zoo_file(algorithm: str) -> Path:
     return Path(package.origin).parent / "hyperparams" / f"{algorithm}.yml"
 
 
-def hash_of(settings: dict[str, Any]) -> str:
+def described(algorithm: str, settings: dict[str, Any]) -> str:
     """
+    :param algorithm: key of :data:`~benchmarks.peers.algorithms.ALGORITHMS`
     :param settings: of a run
-    :return: by which two runs are known to have had the same
+    :return: by which two runs are known to have had the same; ours with the defaults of what they leave out, so that to spell
+        one out changes nothing
     """
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:12]
+    defaults = our_defaults() if algorithm == OURS else {}
+    return json.dumps(defaults | settings, sort_keys=True)
+
+
+@functools.cache
+def our_defaults() -> dict[str, Any]:
+    """:return: of :class:`~sb3_gae.TRPOGAE`"""
+    # Here, since it brings PyTorch along
+    from sb3_gae import TRPOGAE
+
+    arguments = inspect.signature(TRPOGAE).parameters
+    return {name: argument.default for name, argument in arguments.items() if argument.default is not inspect.Parameter.empty}

@@ -1,6 +1,5 @@
 """The shipped settings of the MuJoCo tasks, side by side."""
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -8,9 +7,8 @@ from benchmarks.peers.algorithms import OURS
 from benchmarks.peers.page import markdown_table
 from benchmarks.peers.plan import Cell
 from benchmarks.peers.protocol import MUJOCO_STEPS, MUJOCO_TASKS
-from benchmarks.peers.settings import settings_of
+from benchmarks.peers.settings import our_defaults, settings_of
 from benchmarks.peers.variants import SHIPPED
-from sb3_gae import TRPOGAE
 
 _COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
     "batch": lambda settings: f"{settings['n_envs']} × {settings['n_steps']:,}".replace(",", " "),
@@ -25,10 +23,9 @@ _COLUMNS: dict[str, Callable[[dict[str, Any]], str]] = {
 
 def shipped_table() -> str:
     """:return: what differs between the tasks, defaults of :class:`~sb3_gae.TRPOGAE` included"""
-    defaults = {name: argument.default for name, argument in inspect.signature(TRPOGAE).parameters.items()}
     rows = []
     for task in MUJOCO_TASKS:
-        settings = defaults | settings_of(Cell(task, OURS, SHIPPED, 0, MUJOCO_STEPS))
+        settings = our_defaults() | settings_of(Cell(task, OURS, SHIPPED, 0, MUJOCO_STEPS))
         rows.append([task, *(show(settings) for show in _COLUMNS.values())])
     return markdown_table(["task", *_COLUMNS], rows)
 

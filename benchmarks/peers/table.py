@@ -3,15 +3,16 @@
 import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.journal import Record, State, read_record
+from benchmarks.peers.places import RESULTS
 from benchmarks.peers.plan import Cell
+from benchmarks.peers.settings import described
 
-RESULTS = Path(__file__).parents[1] / "results" / "peers"
 FORMAT = 1
 _OF_THE_RUN = list(Cell._fields)
 
@@ -26,7 +27,6 @@ def rows_of(record: Record) -> Iterator[dict[str, Any]]:
     constants = {
         "format": FORMAT,
         **cell._asdict(),
-        "settings_hash": record.start["settings_hash"],
         "settings": json.dumps(record.start["settings"], sort_keys=True),
         **record.start["origin"],
         "begun": record.start["time"],
@@ -55,41 +55,91 @@ def gather(logs: Path) -> tuple[pd.DataFrame, list[str]]:
     return pd.DataFrame(rows), failures
 
 
-def export(table: pd.DataFrame, folder: Path = RESULTS) -> list[Path]:
+class Exported(NamedTuple):
     """
-    Write a file for each task; runs that stand in a file already and are not in the table stay there.
+    :param paths: of the files
+    :param notes: a line for each run of which the file had another
+    """
+
+    paths: list[Path]
+    notes: list[str]
+
+
+def export(table: pd.DataFrame, folder: Path) -> Exported:
+    """
+    Write a file for each task. A run that stands in a file already stays there, unless the table has the same run, begun no
+    earlier.
 
     :param table: of :func:`gather`
     :param folder: of the files
-    :return: their paths
+    :return: what was done
     :raises PeersError: if there is nothing to write
     """
     if table.empty:
         raise PeersError("There is nothing to export: no run is done; see: python -m benchmarks.peers status")
     folder.mkdir(parents=True, exist_ok=True)
-    paths = []
+    paths, notes = [], []
     for task, rows in table.groupby("task"):
         path = folder / f"{task}.parquet"
         if path.exists():
-            rows = replaced(pd.read_parquet(path), rows)
+            before = pd.read_parquet(path)
+            notes += _changes(_begun(before), _begun(rows))
+            rows = merged(before, rows)
         part = path.with_name(f".{path.name}")
         ordered = rows.sort_values([*_OF_THE_RUN, "step"]).reset_index(drop=True)
         ordered.to_parquet(part, index=False, compression="zstd")
         # A reader, or a full disk, never sees half of it
         part.replace(path)
         paths.append(path)
-    return paths
+    return Exported(paths, notes)
 
 
-def replaced(before: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
+def merged(before: pd.DataFrame, rows: pd.DataFrame) -> pd.DataFrame:
     """
     :param before: a table
     :param rows: of other runs, or of the same
-    :return: both, without what the first has of runs that the second has
+    :return: both; of runs that both have, the one that was begun later, that of the second if they began at once
     """
-    new = set(rows[_OF_THE_RUN].itertuples(index=False, name=None))
-    kept = [run not in new for run in before[_OF_THE_RUN].itertuples(index=False, name=None)]
-    return pd.concat([before[kept], rows], ignore_index=True)
+    old, new = _begun(before), _begun(rows)
+    return pd.concat(
+        [
+            before[[cell not in new or old[cell] > new[cell] for cell in _cells(before)]],
+            rows[[cell not in old or old[cell] <= new[cell] for cell in _cells(rows)]],
+        ],
+        ignore_index=True,
+    )
+
+
+def _changes(old: dict[Cell, int], new: dict[Cell, int]) -> list[str]:
+    notes = []
+    for cell in new.keys() & old.keys():
+        if old[cell] > new[cell]:
+            notes.append(f"not exported, since the file has a run that was begun later: {cell.name}")
+        elif old[cell] < new[cell]:
+            notes.append(f"replaced by a run that was begun later: {cell.name}")
+    return sorted(notes)
+
+
+def _cells(table: pd.DataFrame) -> list[Cell]:
+    return [Cell(*values) for values in table[_OF_THE_RUN].itertuples(index=False, name=None)]
+
+
+def _begun(table: pd.DataFrame) -> dict[Cell, int]:
+    """Second in which each run was begun."""
+    return dict(zip(_cells(table), table["begun"], strict=True))
+
+
+def committed_settings(folder: Path) -> dict[Cell, str]:
+    """
+    :param folder: that :func:`export` wrote to
+    :return: settings of each run, see :func:`~benchmarks.peers.settings.described`
+    """
+    found: dict[Cell, str] = {}
+    for file in folder.glob("*.parquet"):
+        runs = pd.read_parquet(file, columns=[*_OF_THE_RUN, "settings"]).drop_duplicates()
+        for cell, settings in zip(_cells(runs), runs["settings"], strict=True):
+            found[cell] = described(cell.algorithm, json.loads(settings))
+    return found
 
 
 def read_results(folder: Path = RESULTS) -> pd.DataFrame:

@@ -17,9 +17,9 @@ from typing import Any
 
 from benchmarks.peers.algorithms import ALGORITHMS
 from benchmarks.peers.checkpoint import Checkpoint
-from benchmarks.peers.journal import BusyError, Journal, Line, Record, State, journal_path, read_record
+from benchmarks.peers.journal import BusyError, Journal, Line, Record, State, described_in, journal_path, read_record
 from benchmarks.peers.plan import Cell
-from benchmarks.peers.settings import hash_of, settings_of
+from benchmarks.peers.settings import described, settings_of
 
 #: exit status where another process has the run
 BUSY = 3
@@ -69,8 +69,8 @@ def _run(cell: Cell, logs: Path, journal: Journal) -> None:
     settings, folder = settings_of(cell), logs / cell.name
     start = {
         "cell": list(cell),
-        "settings": settings,
-        "settings_hash": hash_of(settings),
+        # With defaults, which may change later
+        "settings": json.loads(described(cell.algorithm, settings)),
         "origin": origin(),
         "time": round(time.time()),
     }
@@ -119,7 +119,7 @@ def continued(before: Record, start: Line, checkpoint: Checkpoint | None) -> tup
 def _sameness(start: Line) -> Line:
     # Not the commit: documents and tests change, too, while runs of days go on
     origin = {name: value for name, value in start["origin"].items() if name != "commit"}
-    return {"cell": start["cell"], "settings_hash": start["settings_hash"], "origin": origin}
+    return {"cell": start["cell"], "settings": described_in(start), "origin": origin}
 
 
 def in_one_line(error: BaseException) -> str:
