@@ -1,13 +1,13 @@
 """Batches of observations that are tensors or dictionaries of tensors."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
-# Observations' values in one pass without gradients: bounds the memory of activations for images
+# Observations' values in one pass: bounds the memory of activations for images
 _CHUNK_VALUES = 2**24
 
 
@@ -43,9 +43,18 @@ class TrainingBatch:
 
     def first(self) -> "TrainingBatch":
         """
-        :return: its first sample alone, enough to see what depends on which parameters
+        :return: its first sample alone, enough to see what an MLP's outputs depend on
         """
         return self.take(th.zeros(1, dtype=th.long, device=self.advantages.device))
+
+    def parts(self) -> Iterator["TrainingBatch"]:
+        """
+        :return: all samples in pieces that bound the memory of activations
+        """
+        for piece in _pieces(self.observations):
+            yield TrainingBatch(
+                take(self.observations, piece), self.actions[piece], self.advantages[piece], self.value_targets[piece]
+            )
 
 
 def take(observations: PyTorchObs, indices: th.Tensor | slice) -> PyTorchObs:
@@ -119,10 +128,13 @@ def in_chunks(function: Callable[..., th.Tensor], observations: PyTorchObs, *oth
     :param others: shape (B, ...)
     :return: shape (B, ...)
     """
+    with th.no_grad():
+        parts = [function(take(observations, piece), *(other[piece] for other in others)) for piece in _pieces(observations)]
+    return parts[0] if len(parts) == 1 else th.cat(parts)
+
+
+def _pieces(observations: PyTorchObs) -> list[slice]:
     size = batch_size(observations)
     tensors = list(observations.values()) if isinstance(observations, dict) else [observations]
     rows = max(1, _CHUNK_VALUES * size // max(1, sum(tensor.numel() for tensor in tensors)))
-    pieces = [slice(start, start + rows) for start in range(0, size, rows)]
-    with th.no_grad():
-        parts = [function(take(observations, piece), *(other[piece] for other in others)) for piece in pieces]
-    return parts[0] if len(parts) == 1 else th.cat(parts)
+    return [slice(start, start + rows) for start in range(0, size, rows)]

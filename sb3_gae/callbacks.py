@@ -8,6 +8,7 @@ from typing import Any
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_gae.callback_tree import check_hears_of_rollouts
 from sb3_gae.checks import check_count, check_number, check_unit_interval
 from sb3_gae.diagnostics.rollout_diagnostics import LambdaErrors, has_several_trajectories, lambda_errors
 from sb3_gae.diagnostics.rollout_file import record, save_rollout
@@ -19,7 +20,20 @@ from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer, LambdaSweep
 _LONGEST_KEY_OF_A_TABLE = 33
 
 
-class LambdaSweepCallback(BaseCallback):
+class _OfRollouts(BaseCallback):
+    """Acts at the end of rollouts."""
+
+    def _init_callback(self) -> None:
+        check_hears_of_rollouts(self)
+
+    def _on_training_start(self) -> None:
+        check_hears_of_rollouts(self)
+
+    def _on_step(self) -> bool:
+        return True
+
+
+class LambdaSweepCallback(_OfRollouts):
     r"""
     Logs, after each rollout, what other :math:`\lambda` would have made of it. Needs no further samples.
 
@@ -40,15 +54,12 @@ class LambdaSweepCallback(BaseCallback):
         self.gamma = gamma
         self.sweep: LambdaSweep | None = None
 
-    def _on_step(self) -> bool:
-        return True
-
     def _on_rollout_end(self) -> None:
         self.sweep = _rollout_buffer(self).lambda_sweep(self.lambdas, self.gamma)
         _log(self, "sweep", self.sweep, self.lambdas)
 
 
-class GradientDiagnosticsCallback(BaseCallback):
+class GradientDiagnosticsCallback(_OfRollouts):
     r"""
     Logs, after a rollout, how far the policy gradient is off with each :math:`\lambda`: bias, variance and their sum.
 
@@ -89,9 +100,6 @@ class GradientDiagnosticsCallback(BaseCallback):
         self.value_errors: ValueErrors | None = None
         self._n_rollouts = 0
 
-    def _on_step(self) -> bool:
-        return True
-
     def _on_rollout_end(self) -> None:
         rollout_buffer = _rollout_buffer(self)
         due, self._n_rollouts = self._n_rollouts % self.every == 0, self._n_rollouts + 1
@@ -111,7 +119,7 @@ class GradientDiagnosticsCallback(BaseCallback):
         self.logger.record("value_error/policy_gradient", float(errors.bias_squared[lambdas.index(0.0)]))
 
 
-class SaveRolloutCallback(BaseCallback):
+class SaveRolloutCallback(_OfRollouts):
     r"""
     Saves each rollout as it ends, in the place of the one before, for ``python -m sb3_gae.gridworld --rollout``.
 
@@ -132,9 +140,6 @@ class SaveRolloutCallback(BaseCallback):
         self.name = name
         self.every = every
         self._n_rollouts = 0
-
-    def _on_step(self) -> bool:
-        return True
 
     def _on_rollout_end(self) -> None:
         due, self._n_rollouts = self._n_rollouts % self.every == 0, self._n_rollouts + 1

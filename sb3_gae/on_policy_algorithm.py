@@ -232,11 +232,13 @@ class GAEOnPolicyAlgorithm(OnPolicyAlgorithm):
         check_finite_rollout("value target", rollout_buffer.returns)
 
     def _value_head(self) -> ValueHead | None:
-        """The layer whose scale follows the returns, if it is to and is not frozen."""
+        """The layer whose scale follows the returns, if it is to and can."""
         head = getattr(self.policy, "value_net", None)
         if not self.normalize_value or self.baseline != "value" or not isinstance(head, ValueHead):
             return None
-        return head if all(parameter.requires_grad for parameter in head.parameters()) else None
+        # Nor can it follow in weights that are computed from others, as `weight_norm` has them
+        is_plain = "weight" in dict(head.named_parameters(recurse=False))
+        return head if is_plain and all(parameter.requires_grad for parameter in head.parameters()) else None
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_rollout_end"]

@@ -7,6 +7,7 @@ import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from sb3_gae.batch import TrainingBatch, random_subset, standardized
 from sb3_gae.hyperparameters import check_batch, check_hyperparameters, warn_of_unused
@@ -240,7 +241,8 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
         parameters = self._parameter_groups(batch)
         if not parameters.of_policy:
             raise ValueError("The action distribution depends on no trainable parameter; give the policy layers.")
-        with all_or_nothing(self.policy):
+        # Attention's fused kernels have no second derivative
+        with all_or_nothing(self.policy), sdpa_kernel(SDPBackend.MATH):
             if self.value_fit_first:
                 value_record = self._fit_value(batch, parameters)
                 self._estimate_advantages(self.rollout_buffer)

@@ -1,15 +1,24 @@
 """The sweep in the log."""
 
+import signal
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback, EveryNTimesteps
 from stable_baselines3.common.env_util import make_vec_env
 
-from sb3_gae import TRPOGAE, GAERolloutBuffer, GradientDiagnosticsCallback, LambdaSweepCallback
+from sb3_gae import (
+    TRPOGAE,
+    GAERolloutBuffer,
+    GradientDiagnosticsCallback,
+    LambdaSweepCallback,
+    ResumableCheckpointCallback,
+    SaveRolloutCallback,
+)
 
 LAMBDAS = (0.0, 0.9, 1.0)
 
@@ -49,6 +58,39 @@ def test_works_with_another_algorithm_on_our_buffer() -> None:
 def test_bad_factors_are_refused_before_a_rollout(callback: Any, bad: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=f"`{next(iter(bad))}` must be"):
         callback(**bad)
+
+
+CALLBACKS = {
+    "sweep": lambda folder: LambdaSweepCallback(LAMBDAS),
+    "diagnostics": lambda folder: GradientDiagnosticsCallback(LAMBDAS),
+    "rollouts": lambda folder: SaveRolloutCallback(folder / "rollout.npz"),
+    "checkpoints": lambda folder: ResumableCheckpointCallback(1, folder),
+}
+OUTER = {
+    "EveryNTimesteps": lambda inner, env: EveryNTimesteps(8, inner),
+    "EvalCallback": lambda inner, env: EvalCallback(env, callback_after_eval=inner, eval_freq=8, verbose=0),
+    "list in EvalCallback": lambda inner, env: EvalCallback(env, callback_after_eval=CallbackList([inner]), verbose=0),
+    "new best": lambda inner, env: EvalCallback(env, callback_on_new_best=inner, eval_freq=8, verbose=0),
+    "list of lists": lambda inner, env: CallbackList([CallbackList([Record(), EveryNTimesteps(8, inner)])]),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*not wrapped with a")
+@pytest.mark.parametrize("what", CALLBACKS)
+@pytest.mark.parametrize("outer", OUTER)
+def test_callbacks_of_rollouts_are_refused_where_they_would_not_hear_of_them(outer: str, what: str, tmp_path: Path) -> None:
+    model = TRPOGAE("MlpPolicy", make_vec_env("CartPole-v1", 2, seed=0), n_steps=16, device="cpu")
+    callback = OUTER[outer](CALLBACKS[what](tmp_path), make_vec_env("CartPole-v1", 1))
+    with pytest.raises(ValueError, match=r"Callback must stand beside (EveryNTimesteps|EvalCallback), not in it"):
+        model.learn(32, callback)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_callbacks_of_rollouts_stand_beside_others(tmp_path: Path) -> None:
+    model = TRPOGAE("MlpPolicy", make_vec_env("CartPole-v1", 2, seed=0), n_steps=16, device="cpu")
+    inner = [make(tmp_path) for make in CALLBACKS.values()]
+    model.learn(32, [EveryNTimesteps(8, Record()), CallbackList(inner)])
+    assert {path.suffix for path in tmp_path.iterdir()} == {".npz", ".zip"}
 
 
 def test_says_which_buffer_it_needs() -> None:

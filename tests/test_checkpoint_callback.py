@@ -1,5 +1,7 @@
 """When and where checkpoints are written, which of them are kept, and what the callback refuses."""
 
+import copy
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +79,26 @@ def test_a_training_in_which_another_callback_stops_goes_on_from_the_last_whole_
 def test_bad_arguments_are_refused(name: str, value: Any, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=f"`{name}` must be"):
         ResumableCheckpointCallback(**({"save_freq": 1, "save_path": tmp_path} | {name: value}))
+
+
+def test_a_callback_may_copy_the_model(tmp_path: Path) -> None:
+    """As for self-play, or to keep the best one in memory."""
+    copies: list[TRPOGAE] = []
+
+    def keep(locals_: dict[str, Any], globals_: dict[str, Any]) -> bool:
+        model = locals_["self"]
+        copies[:] = [copy.deepcopy(model), pickle.loads(pickle.dumps(model))]
+        return True
+
+    model = make_model(cart_poles())
+    model.learn(2 * STEPS, callback=[ResumableCheckpointCallback(64, tmp_path), ConvertCallback(keep)])
+    assert len(copies) == 2
+    for duplicate in copies:
+        before = state_of(duplicate.policy)
+        # `VecNormalize` is not one to be copied with its environments
+        duplicate.set_env(cart_poles())
+        duplicate.learn(STEPS)
+        assert differing(before, state_of(duplicate.policy)) != []
 
 
 def test_other_algorithms_are_refused(tmp_path: Path) -> None:

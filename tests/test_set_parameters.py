@@ -30,6 +30,23 @@ def test_parameters_go_from_a_file_to_a_model(some_model: TRPOGAE, model_file: b
         check_same(other, some_model)
 
 
+def test_weights_go_back_to_contrib_with_the_scale_multiplied_in() -> None:
+    """As docs/migrating.md has it."""
+    model = trained_model()
+    weights = model.get_parameters()["policy"]
+    scale = weights.pop("value_net.scale")
+    del weights["value_net.n_batches"]
+    assert scale != 1.0
+    weights |= {name: scale * weights[name] for name in ("value_net.weight", "value_net.bias")}
+    other = sb3_contrib.TRPO("MlpPolicy", vec_env(), n_steps=16, policy_kwargs=model.policy_kwargs)
+    other.set_parameters({"policy": weights}, exact_match=False)
+    observations = th.as_tensor(vec_env().reset())
+    th.testing.assert_close(other.policy.predict_values(observations), model.policy.predict_values(observations))
+    th.testing.assert_close(
+        other.predict(observations.numpy(), deterministic=True)[0], model.predict(observations.numpy(), deterministic=True)[0]
+    )
+
+
 def test_some_parameters_can_be_replaced() -> None:
     other = trained_model()
     assert other.policy.value_net.scale != 1.0

@@ -177,6 +177,59 @@ def test_targets_may_have_any_shape_and_are_not_modified() -> None:
     assert th.equal(targets, before)
 
 
+# --- Weights that somebody has set ---
+
+
+def set_weights(head: ValueHead) -> None:
+    with th.no_grad():
+        head.weight.add_(1.0)
+
+
+def test_values_that_were_trained_before_stay_as_they_are() -> None:
+    head = new_head()
+    set_weights(head)
+    # As of a file of the other layers alone
+    head.load_state_dict({}, strict=False)
+    before = head(features()).detach()
+    head.initialize_scale(th.tensor([100.0]))
+    assert head.scale == 1.0
+    head.update_scale(th.tensor([100.0]))
+    assert head.scale == 100.0
+    th.testing.assert_close(head(features()), before, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("is_set", [True, False])
+def test_a_file_knows_whether_weights_were_set(is_set: bool) -> None:
+    head = new_head()
+    if is_set:
+        set_weights(head)
+    for other in (by_torch_file(head), by_pickle(head), copy.deepcopy(head)):
+        assert other.is_as_constructed is not is_set
+        other.initialize_scale(th.tensor([100.0]))
+        assert other.scale == (1.0 if is_set else 100.0)
+    assert head.n_batches == 0
+
+
+@pytest.mark.parametrize("how", ["load_from_vector", "copied parameters", "pretrained critic"])
+def test_the_first_rollout_has_the_values_of_a_critic_that_was_trained_before(how: str) -> None:
+    policy, other = small_policy(MlpPolicy), small_policy(MlpPolicy)
+    with th.no_grad():
+        for parameter in other.parameters():
+            parameter.add_(0.1)
+    if how == "load_from_vector":
+        policy.load_from_vector(other.parameters_to_vector())
+    elif how == "copied parameters":
+        for mine, theirs in zip(policy.parameters(), other.parameters(), strict=True):
+            mine.data.copy_(theirs.data)
+    else:
+        optimizer = th.optim.Adam(policy.value_net.parameters(), 1e-3)
+        policy.predict_values(th.randn(8, 2)).square().mean().backward()
+        optimizer.step()
+    before = policy.predict_values(th.ones(1, 2))
+    policy.value_net.initialize_scale(th.tensor([100.0]))
+    assert th.equal(policy.predict_values(th.ones(1, 2)), before)
+
+
 # --- Copies and files ---
 
 

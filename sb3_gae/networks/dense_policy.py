@@ -124,10 +124,17 @@ def _hold_exactly(layers: Sequence[nn.Module], others: Sequence[th.Tensor], para
 
 
 def _inherits(policy: ActorCriticPolicy, *methods: str) -> bool:
-    """Whether the policy leaves these methods as SB3 wrote them, and no hook changes what a module returns."""
-    hooked = any(module._forward_hooks or module._forward_pre_hooks for module in policy.modules())
+    """Whether the policy leaves these methods as SB3 wrote them, and nothing changes what a module returns."""
+    if any(map(_is_changed, policy.modules())) or any(method in vars(policy) for method in methods):
+        return False
     # A policy that `torch.compile` has wrapped is of a class without any
-    return not hooked and all(getattr(type(policy), method, None) is getattr(ActorCriticPolicy, method) for method in methods)
+    return all(getattr(type(policy), method, None) is getattr(ActorCriticPolicy, method) for method in methods)
+
+
+def _is_changed(module: nn.Module) -> bool:
+    """Whether a hook, or a method put in the place of the class's own, may change what it returns."""
+    replaced = vars(module).keys() & {"forward", "forward_actor", "forward_critic"}
+    return bool(replaced or module._forward_hooks or module._forward_pre_hooks)
 
 
 def _features(policy: ActorCriticPolicy, observations: PyTorchObs, extractor: BaseFeaturesExtractor) -> th.Tensor:

@@ -1,8 +1,10 @@
 """Parameters as one flat vector, and which of them a result depends on."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import torch as th
+
+from sb3_gae.batch import TrainingBatch
 
 
 def influencing_parameters(outputs: th.Tensor, candidates: Iterable[th.Tensor]) -> list[th.Tensor]:
@@ -18,6 +20,22 @@ def influencing_parameters(outputs: th.Tensor, candidates: Iterable[th.Tensor]) 
         return []
     gradients = th.autograd.grad(outputs.sum(), trainable, allow_unused=True)
     return [parameter for parameter, gradient in zip(trainable, gradients, strict=True) if gradient is not None]
+
+
+def influencing_in_batch(
+    outputs: Callable[[TrainingBatch], th.Tensor], candidates: Iterable[th.Tensor], batch: TrainingBatch
+) -> list[th.Tensor]:
+    """
+    The same of a whole batch: a network may choose by what it sees which of its layers a sample goes through.
+
+    :param outputs: of a piece of the batch, any tensor with a graph behind it
+    :param candidates: parameters to choose from
+    :param batch: at least one sample
+    :return: in the order of ``candidates``
+    """
+    candidates = list(candidates)
+    found = {id(parameter) for part in batch.parts() for parameter in influencing_parameters(outputs(part), candidates)}
+    return [parameter for parameter in candidates if id(parameter) in found]
 
 
 def flat_gradient(

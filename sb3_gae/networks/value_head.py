@@ -30,6 +30,7 @@ class ValueHead(nn.Linear):
         self.bias = linear.bias
         self.register_buffer("scale", th.ones((), device=linear.weight.device))
         self.register_buffer("n_batches", th.zeros((), dtype=th.long, device=linear.weight.device))
+        self._constructed = self._copies()
 
     def forward(self, features: th.Tensor) -> th.Tensor:
         """
@@ -48,8 +49,16 @@ class ValueHead(nn.Linear):
 
     @property
     def is_as_constructed(self) -> bool:
-        """Whether neither a factor nor weights with one have been set."""
-        return bool(self.n_batches == 0 and self.scale == 1.0)
+        """Whether neither a factor nor weights have been set, as by whoever pretrains the value function."""
+        if self.n_batches != 0 or self.scale != 1.0:
+            return False
+        present = dict(self.named_parameters())
+        return self._constructed.keys() == present.keys() and all(
+            th.equal(then.to(present[name]), present[name]) for name, then in self._constructed.items()
+        )
+
+    def _copies(self) -> dict[str, th.Tensor]:
+        return {name: parameter.detach().clone() for name, parameter in self.named_parameters()}
 
     @th.no_grad()
     def initialize_scale(self, returns: th.Tensor) -> None:
@@ -80,11 +89,20 @@ class ValueHead(nn.Linear):
                 self.bias.mul_(ratio)
             self.scale.copy_(new_scale)
 
+    def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if self.n_batches == 0 and not self.is_as_constructed:
+            # Weights that somebody has set are in units of the reward wherever they go
+            destination[prefix + "n_batches"] = th.ones_like(self.n_batches)
+
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:
         # Weights without a scale are those of a plain layer; where there are none, this layer keeps its scale
         for name in ("scale", "n_batches") if prefix + "weight" in state_dict else ():
             state_dict.setdefault(prefix + name, th.ones_like(getattr(self, name)))
         super()._load_from_state_dict(state_dict, prefix, *args)
+        if prefix + "weight" in state_dict:
+            # What comes with its scale says by itself whether it is as it was constructed
+            self._constructed = self._copies()
 
 
 def _can_divide_by(scale: th.Tensor) -> bool:

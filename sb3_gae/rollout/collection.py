@@ -205,7 +205,9 @@ def take_steps(
         actions = sample(observations, step)
         clipped_actions = environment_actions(policy, actions)
         result = step_environments(env, clipped_actions)
-        new_observations, (_, rewards, dones, infos) = cast(Observations, result[0]), result
+        new_observations, infos = cast(Observations, result[0]), result[3]
+        # Environments of one's own may return lists and floats
+        rewards, dones = np.asarray(result[1]), np.asarray(result[2], dtype=bool)
         check_finite_step("reward", rewards, step, first_env)
         check_finite_step("observation", new_observations, step + 1, first_env)
         yield Step(

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-# Of every callback, and set anew by SB3
-_SET_BY_SB3 = frozenset({"model", "parent", "locals", "globals"})
+from sb3_gae.callback_tree import SET_BY_SB3, with_children
 
 #: attributes by name, each pickled, for each callback by its class and how many of this class come before it
 CallbackStates = dict[str, dict[str, bytes]]
@@ -41,28 +40,14 @@ def restore_callbacks(root: BaseCallback, states: CallbackStates) -> None:
 
 def _named(root: BaseCallback) -> Iterator[tuple[str, BaseCallback]]:
     counts: Counter[str] = Counter()
-    for callback in _with_children(root, set()):
+    for callback in with_children(root):
         kind = f"{type(callback).__module__}.{type(callback).__qualname__}"
         yield f"{kind} {counts[kind]}", callback
         counts[kind] += 1
 
 
-def _with_children(callback: BaseCallback, seen: set[int]) -> Iterator[BaseCallback]:
-    if id(callback) in seen:
-        return
-    seen.add(id(callback))
-    yield callback
-    for name, value in vars(callback).items():
-        children = value if isinstance(value, list) else [value]
-        for child in children if name not in _SET_BY_SB3 else []:
-            if isinstance(child, BaseCallback):
-                yield from _with_children(child, seen)
-
-
 def _plain_attributes(callback: BaseCallback) -> dict[str, bytes]:
-    return {
-        name: pickle.dumps(value) for name, value in vars(callback).items() if name not in _SET_BY_SB3 and _is_plain(value)
-    }
+    return {name: pickle.dumps(value) for name, value in vars(callback).items() if name not in SET_BY_SB3 and _is_plain(value)}
 
 
 def _is_plain(value: Any) -> bool:

@@ -7,6 +7,7 @@ from typing import cast
 
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_gae.callback_tree import check_hears_of_rollouts
 from sb3_gae.checks import check_choice, check_count
 from sb3_gae.errors import WorkersLostError
 from sb3_gae.saving.atomic_write import write_atomically
@@ -45,7 +46,8 @@ class ResumableCheckpointCallback(BaseCallback):
     :param keep: number of checkpoints to keep
     :param handle_signals: whether to keep SIGTERM and Ctrl-C until the end of an iteration
     :param verbose: 0 no output but on SIGTERM and Ctrl-C, 1 for each checkpoint
-    :raises ValueError: if a number is out of range
+    :raises ValueError: if a number is out of range; in ``learn``, if it is in another callback that does not tell it of
+        rollouts, or the folder has checkpoints of a training that is ahead
     """
 
     def __init__(
@@ -75,9 +77,11 @@ class ResumableCheckpointCallback(BaseCallback):
     def _init_callback(self) -> None:
         if not isinstance(self.model, ResumableModel):
             raise TypeError(f"{type(self).__name__} needs a TRPOGAE, got {type(self.model).__name__}; use CheckpointCallback.")
+        check_hears_of_rollouts(self)
         self.save_path.mkdir(parents=True, exist_ok=True)
 
     def _on_training_start(self) -> None:
+        check_hears_of_rollouts(self)
         self._check_folder()
         root = self.locals["callback"]
         self._next_save, self._last_saved = self.n_calls, -1

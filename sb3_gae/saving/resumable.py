@@ -126,5 +126,10 @@ class ResumableModel(SavedModel):
                 advice = "No checkpoint was written; ResumableCheckpointCallback would have."
                 raise WorkersLostError(f"{error} {self._rescue() if self._rescue else advice}") from error
 
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy, such as callbacks keep of the best model, is of no training that could end or be rescued
+        of_the_training = set(self._of_the_process) - {"_resumed"}
+        return {name: value for name, value in vars(self).items() if name not in of_the_training}
+
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *self._of_the_process]

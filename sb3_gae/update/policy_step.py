@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.networks.dense_policy import dense_policy_network, has_dense_policy, policy_log_std
 from sb3_gae.networks.distributions import distribution_from_outputs, fisher_metric, mean_kl, snapshot
-from sb3_gae.networks.parameters import flat_gradient, influencing_parameters
+from sb3_gae.networks.parameters import flat_gradient, influencing_in_batch, influencing_parameters
 from sb3_gae.update.curvature import CurvatureProduct, hessian_product
 from sb3_gae.update.kronecker import KroneckerPreconditioner, OutputMoments
 from sb3_gae.update.trust_region import LocalProblem, StepRecord, TrustRegionSettings, trust_region_step
@@ -22,11 +22,15 @@ def policy_parameters(policy: ActorCriticPolicy, batch: TrainingBatch) -> list[t
     """
     :param policy: any actor-critic policy
     :param batch: at least one sample
-    :return: the trainable parameters that the action distribution depends on
+    :return: the trainable parameters that the action distribution depends on, in whichever sample
     """
-    sample = batch.first()
-    log_prob = policy.get_distribution(sample.observations).log_prob(sample.actions)
-    return influencing_parameters(log_prob, policy.parameters())
+
+    def log_prob(part: TrainingBatch) -> th.Tensor:
+        return policy.get_distribution(part.observations).log_prob(part.actions)
+
+    # Every sample goes through all of an MLP: one of them is enough there
+    found = influencing_parameters(log_prob(batch.first()), policy.parameters())
+    return found if has_dense_policy(policy, found) else influencing_in_batch(log_prob, policy.parameters(), batch)
 
 
 def policy_step(

@@ -17,7 +17,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.networks.dense_policy import has_dense_policy
 from sb3_gae.networks.distributions import mean_kl, snapshot
-from sb3_gae.networks.parameters import influencing_parameters, positions
+from sb3_gae.networks.parameters import influencing_in_batch, positions
 from sb3_gae.update.curvature import CurvatureProduct
 from sb3_gae.update.kronecker import OutputMoments
 from sb3_gae.update.policy_step import DenseFisher, autograd_fisher_product
@@ -43,10 +43,9 @@ def shared_parameters(
     :param policy: any actor-critic policy
     :param batch: at least one sample
     :param policy_parameters: what the action distribution depends on
-    :return: those of them that the value depends on, too
+    :return: those of them that the value depends on, too, in whichever sample
     """
-    sample = batch.first()
-    return influencing_parameters(policy.predict_values(sample.observations), policy_parameters)
+    return influencing_in_batch(lambda part: policy.predict_values(part.observations), policy_parameters, batch)
 
 
 class ParameterGroups(NamedTuple):

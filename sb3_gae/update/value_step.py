@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gae.batch import TrainingBatch, in_chunks, take
 from sb3_gae.networks.dense_policy import dense_value_network, has_dense_value
-from sb3_gae.networks.parameters import flat_gradient, influencing_parameters
+from sb3_gae.networks.parameters import flat_gradient, influencing_in_batch, influencing_parameters
 from sb3_gae.networks.value_head import ValueHead
 from sb3_gae.update.curvature import CurvatureProduct, hessian_product
 from sb3_gae.update.kronecker import NOTHING_ADDED, KroneckerPreconditioner, OutputMoments
@@ -36,12 +36,17 @@ def value_parameters(
     :param policy: any actor-critic policy
     :param batch: at least one sample
     :param policy_parameters: what the action distribution depends on, which the value step must not move
-    :return: the other trainable parameters that the value depends on
+    :return: the other trainable parameters that the value depends on, in whichever sample
     """
-    sample = batch.first()
-    found = influencing_parameters(policy.predict_values(sample.observations), policy.parameters())
     shared = {id(parameter) for parameter in policy_parameters}
-    return [parameter for parameter in found if id(parameter) not in shared]
+    others = [parameter for parameter in policy.parameters() if id(parameter) not in shared]
+
+    def values(part: TrainingBatch) -> th.Tensor:
+        return policy.predict_values(part.observations)
+
+    # Every sample goes through all of an MLP: one of them is enough there
+    found = influencing_parameters(values(batch.first()), others)
+    return found if has_dense_value(policy, found) else influencing_in_batch(values, others, batch)
 
 
 @dataclass(frozen=True)
@@ -221,7 +226,8 @@ class _AutogradValues:
         return hessian_product(0.5 * (values - values.detach()).square().mean(), self.parameters), None
 
     def _predict(self, observations: PyTorchObs) -> th.Tensor:
-        return self._policy.predict_values(observations).squeeze(1) / value_scale(self._policy)
+        # A policy of one's own may leave the axis of the one value out
+        return self._policy.predict_values(observations).flatten() / value_scale(self._policy)
 
 
 class _Fit:
