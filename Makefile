@@ -72,6 +72,7 @@ bench-full: bench $(TIANSHOU)/.installed
 	$(IN_VENV) python benchmarks/update_speed.py
 	$(IN_VENV) python benchmarks/rollout_speed.py
 	$(IN_VENV) python -m benchmarks.speed run
+	$(IN_VENV) python -m benchmarks.speed targets
 	$(IN_VENV) python -m benchmarks.speed profile
 	$(IN_VENV) python -m benchmarks.speed threads
 	$(IN_VENV) python -m benchmarks.speed report

@@ -17,7 +17,8 @@ from benchmarks.peers.errors import PeersError
 from benchmarks.peers.page import filled
 from benchmarks.speed import operations as ops
 from benchmarks.speed import report, results, tables
-from benchmarks.speed.case import DOUBLE_BACKWARD, LIMIT, OURS, PEER
+from benchmarks.speed import targets as speed_targets
+from benchmarks.speed.case import DOUBLE_BACKWARD, LIMIT, OURS, PEER, Case, Prepared
 from benchmarks.speed.cli import main
 from benchmarks.speed.growth import exponent
 from benchmarks.speed.matrix_products import matrix_products
@@ -200,15 +201,35 @@ def test_tables_say_ratios_exponents_and_rates() -> None:
     )
     assert "| update | batch 1 000 to 4 000 | 1.00 | 1.00 | 1.00 | 1.00 |" in tables.growth_table(rows)
     assert "| update | batch 4 000 | 4 | 100.0 | 12 | 6 |" in tables.arithmetic_table(rows)
-    targets = tables.targets_table(rows)
-    assert "| batch 4 000 | 2.00 | 0.50 | yes |" in targets
-    assert "| batch 4 000 | 2.00 | 0.50 | **no** |" in targets
+
+
+def test_ours_and_its_limit_take_turns_at_the_largest_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(speed_targets, "PAUSE", 0.0)
+    calls: list[str] = []
+
+    def case(size: int, who: str, part: str = "update") -> Case:
+        name = f"{who} {size}"
+        return Case(part, "batch", size, who, lambda: Prepared(lambda: calls.append(name), lambda: calls.append("before")))
+
+    cases = [case(size, who) for size in (10, 20) for who in (OURS, PEER, LIMIT)] + [case(20, OURS, "policy step")]
+    (row,) = speed_targets._rows(cases, plan(quick=True, threads=1))
+    assert calls == ["before", "ours 20", "before", "limit 20"] * (speed_targets.QUICK_ROUNDS + 1)
+    assert (row["part"], row["varied"], row["size"], row["rounds"]) == ("update", "batch", 20, speed_targets.QUICK_ROUNDS)
+    assert 0.0 < row["low"] <= row["ratio"] <= row["high"]
+
+
+def test_targets_are_met_or_not() -> None:
+    row = {"varied": "batch", "size": 4000, "rounds": 15, "ratio": 2.0, "low": 1.9, "high": 2.2}
+    table = tables.targets_table([row | {"part": part} for part in ("update", "rollout, GaeBiped-v0")])
+    update, rollout = table.splitlines()[2:]
+    assert update.endswith("| batch 4 000 | 2.00 (1.90 to 2.20) | 0.50 | yes |")
+    assert rollout.endswith("| batch 4 000 | 2.00 (1.90 to 2.20) | 0.50 | **no** |")
+    assert tables.targets_table([]) == ""
 
 
 def test_a_part_without_peer_and_limit_has_empty_cells() -> None:
     rows = [row for row in made_up_rows() if row["contender"] == OURS]
     assert "| update | batch 1 000 | 10.0 ms | 1.00 µs |  |  |  |  |  |" in tables.parts_table(rows)
-    assert tables.targets_table(rows) == ""
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,9 @@ def _parser() -> argparse.ArgumentParser:
     run = verbs.add_parser("run", parents=[counted], help="time every part")
     run.add_argument("--output", type=Path, default=results.SPEED)
     run.set_defaults(command=_run)
+    targets = verbs.add_parser("targets", parents=[counted], help="ours and its limit in turn, where there is a target")
+    targets.add_argument("--output", type=Path, default=results.TARGETS)
+    targets.set_defaults(command=_targets)
     profile = verbs.add_parser("profile", parents=[counted], help="where the seconds of an iteration go")
     profile.add_argument("--output", type=Path, default=results.SECONDS)
     profile.set_defaults(command=_profile)
@@ -46,7 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     threads.add_argument("--output", type=Path, default=results.THREADS)
     threads.set_defaults(command=_threads)
     report = verbs.add_parser("report", help="tables into docs/speed.md, figures into docs/images")
-    report.add_argument("--results", type=Path, default=results.RESULTS, help="folder of the three files (%(default)s)")
+    report.add_argument("--results", type=Path, default=results.RESULTS, help="folder of these files (%(default)s)")
     report.add_argument("--page", type=Path, default=PAGE, help="to be filled (%(default)s)")
     report.add_argument("--images", type=Path, default=IMAGES, help="folder of the figures (%(default)s)")
     report.set_defaults(command=_report)
@@ -60,6 +63,13 @@ def _run(args: argparse.Namespace) -> None:
     from benchmarks.speed.run import run
 
     run(args.output, args.quick, args.threads)
+    print(f"wrote {args.output}")
+
+
+def _targets(args: argparse.Namespace) -> None:
+    from benchmarks.speed.targets import measure
+
+    measure(args.output, args.quick, args.threads)
     print(f"wrote {args.output}")
 
 

@@ -23,9 +23,9 @@ def sections_of(folder: Path) -> dict[str, str]:
     :param folder: of the files of results
     :return: Markdown by the name of the section
     """
-    speed, seconds, threads = _read(folder)
+    speed, targets, seconds, threads = _read(folder)
     return {
-        "targets": tables.targets_table(speed["rows"]),
+        "targets": tables.targets_table(targets["rows"]),
         "origin": tables.origin_list(speed),
         "growth": tables.growth_table(speed["rows"]),
         "figure growth": _shown("speed_growth", speed),
@@ -38,7 +38,7 @@ def sections_of(folder: Path) -> dict[str, str]:
 
 
 def _read(folder: Path) -> list[dict[str, Any]]:
-    return [results.read(folder / path.name) for path in (results.SPEED, results.SECONDS, results.THREADS)]
+    return [results.read(folder / path.name) for path in (results.SPEED, results.TARGETS, results.SECONDS, results.THREADS)]
 
 
 def _shown(name: str, found: dict[str, Any]) -> str:
@@ -53,8 +53,9 @@ def write_report(folder: Path = results.RESULTS, page: Path = PAGE, images: Path
     :return: paths of what was written
     :raises PeersError: if there are no results
     """
-    speed, seconds, threads = _read(folder)
-    if not (speed["rows"] or seconds["rows"] or threads["rows"]):
+    found = _read(folder)
+    speed, _, seconds, _ = found
+    if not any(of_verb["rows"] for of_verb in found):
         raise PeersError(f"There are no results in {folder} yet; measure first: python -m benchmarks.speed run")
     # The other commands would wait for it
     from matplotlib import rc_context
@@ -68,8 +69,8 @@ def write_report(folder: Path = results.RESULTS, page: Path = PAGE, images: Path
     images.mkdir(parents=True, exist_ok=True)
     draws = {"speed_growth": (growth_figure, speed), "iteration_seconds": (seconds_figure, seconds)}
     with rc_context(STYLE):
-        for name, (draw, found) in draws.items():
-            if found["rows"]:
+        for name, (draw, shown) in draws.items():
+            if shown["rows"]:
                 written.append(images / f"{name}.svg")
-                save_figure(draw(found["rows"]), written[-1])
+                save_figure(draw(shown["rows"]), written[-1])
     return written

@@ -10,7 +10,9 @@ from benchmarks.peers.provenance import origin
 
 RESULTS = Path(__file__).parents[1] / "results"
 #: of each verb
-SPEED, SECONDS, THREADS = (RESULTS / f"{name}.json" for name in ("speed", "iteration_seconds", "threads"))
+SPEED, TARGETS, SECONDS, THREADS = (
+    RESULTS / f"{name}.json" for name in ("speed", "speed_targets", "iteration_seconds", "threads")
+)
 
 
 def rows_of(raw: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -1,6 +1,6 @@
 """The timed rows by what was done, what was varied, and who did it."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from benchmarks.speed.case import LIMIT, OURS, PEER
@@ -60,29 +60,6 @@ class Group(NamedTuple):
         return exponent([row["size"] for row in rows], [row["median"] for row in rows])
 
 
-class Target(NamedTuple):
-    """
-    :param title: for people
-    :param part: what is timed
-    :param largest: the most that ours may cost, in units of the limit
-    :param varied: at the largest batch, or number of environments, that is timed
-    """
-
-    title: str
-    part: str
-    largest: float
-    varied: str = "batch"
-
-
-TARGETS = (
-    Target("update: at most 2 times the matrix products of its arithmetic", "update", 2.0),
-    Target("collecting: at most 1.5 times the batched physics, GaeBiped-v0", "rollout, GaeBiped-v0", 1.5),
-    Target("collecting: at most 1.5 times the batched physics, HalfCheetah-v5", "rollout, HalfCheetah-v5", 1.5),
-    Target("… with more environments", "rollout, HalfCheetah-v5", 1.5, "environments"),
-    Target("the biped end to end: at least 0.3 of the speed of open-loop physics", "iteration, GaeBiped-v0", 1 / 0.3),
-)
-
-
 def groups_of(rows: Sequence[Row]) -> list[Group]:
     """
     :param rows: of results
@@ -90,18 +67,6 @@ def groups_of(rows: Sequence[Row]) -> list[Group]:
     """
     names = dict.fromkeys((row["part"], row["varied"]) for row in rows)
     return [Group(*name, [row for row in rows if (row["part"], row["varied"]) == name]) for name in names]
-
-
-def judged(groups: Sequence[Group]) -> Iterator[tuple[Target, int, float]]:
-    """
-    :param groups: of results
-    :return: each target that something was timed for, the largest size, and ours in units of the limit there
-    """
-    by_name = {(group.part, group.varied): group for group in groups}
-    for target in TARGETS:
-        group = by_name.get((target.part, target.varied))
-        if group is not None and (found := group.ratio(OURS, LIMIT, group.sizes[-1])) is not None:
-            yield target, group.sizes[-1], found
 
 
 #: as the tables and figures call them

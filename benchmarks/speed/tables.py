@@ -6,7 +6,8 @@ from typing import Any
 
 from benchmarks.peers.page import markdown_table
 from benchmarks.speed.case import DOUBLE_BACKWARD, LIMIT, OURS, PEER
-from benchmarks.speed.table import TITLES, Group, Row, groups_of, judged
+from benchmarks.speed.table import TITLES, Group, Row, groups_of
+from benchmarks.speed.targets import TARGETS
 
 #: keys of a result's origin, as they are shown
 _ORIGIN = {
@@ -26,18 +27,20 @@ _ORIGIN = {
 
 def targets_table(rows: Sequence[Row]) -> str:
     """
-    :param rows: of what was timed
+    :param rows: of what was timed in turn
     :return: each target, what was measured at the largest size, and whether it is met
     """
+    by_name = {(row["part"], row["varied"]): row for row in rows}
     cells = [
         [
             target.title,
-            f"{target.varied} {_whole(size)}",
-            f"{found:.2f}",
-            f"{1.0 / found:.2f}",
-            "yes" if found <= target.largest else "**no**",
+            f"{target.varied} {_whole(row['size'])}",
+            f"{row['ratio']:.2f} ({row['low']:.2f} to {row['high']:.2f})",
+            f"{1.0 / row['ratio']:.2f}",
+            "yes" if row["ratio"] <= target.largest else "**no**",
         ]
-        for target, size, found in judged(groups_of(rows))
+        for target in TARGETS
+        if (row := by_name.get((target.part, target.varied))) is not None
     ]
     return markdown_table(["target", "at", "times the limit's time", "times its speed", "met"], cells)
 
