@@ -256,108 +256,10 @@ def test_a_value_head_that_is_frozen_in_part_keeps_its_scale() -> None:
     assert differing(head, state_of(model.policy.value_net)) == ["weight"]
 
 
-class OwnNames(ActorCriticPolicy):
-    """Layers and methods of its own, none of them by SB3's names."""
-
-    def _build(self, lr_schedule: Any) -> None:
-        self.act, self.judge = nn.Linear(self.features_dim, 2), nn.Linear(self.features_dim, 1)
-        self.log_std = nn.Parameter(th.zeros(2))
-        self.optimizer = self.optimizer_class(self.parameters(), lr=lr_schedule(1))
-
-    def get_distribution(self, obs: Any) -> Any:
-        return self.action_dist.proba_distribution(self.act(obs.float()), self.log_std)
-
-    def predict_values(self, obs: Any) -> th.Tensor:
-        return self.judge(obs.float())
-
-    def evaluate_actions(self, obs: Any, actions: th.Tensor) -> Any:
-        return self.predict_values(obs), self.get_distribution(obs).log_prob(actions), None
-
-    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
-        return self.get_distribution(observation).get_actions(deterministic)
-
-
-class OwnValues(MlpPolicy):
-    def predict_values(self, obs: Any) -> th.Tensor:
-        return super().predict_values(obs)
-
-
-class FlatValues(MlpPolicy):
-    def predict_values(self, obs: Any) -> th.Tensor:
-        return super().predict_values(obs).flatten()
-
-
-def test_values_may_come_without_an_axis_of_their_own() -> None:
-    """SB3 flattens them in any case."""
-    states = []
-    for policy in (OwnValues, FlatValues):
-        model = small_model(vec_env(), policy)
-        check_training(model)
-        states.append(state_of(model.policy))
-    assert differing(*states) == []
-
-
-class Attentive(BaseFeaturesExtractor):
-    """Two layers of attention over the numbers of a vector."""
-
-    def __init__(self, observation_space: spaces.Box):
-        super().__init__(observation_space, features_dim=12)
-        self.embed = nn.Linear(1, 4)
-        self.layers = nn.Sequential(*(nn.TransformerEncoderLayer(4, 2, 8, batch_first=True) for _ in range(2)))
-
-    def forward(self, observations: th.Tensor) -> th.Tensor:
-        return self.layers(self.embed(observations[..., None])).flatten(1)
-
-
-@pytest.mark.parametrize("share", [True, False])
-def test_attention_is_differentiated_twice(share: bool) -> None:
-    policy_kwargs = {"net_arch": [], "features_extractor_class": Attentive, "share_features_extractor": share}
-    check_training(small_model(vec_env(), policy_kwargs=policy_kwargs))
-
-
-def test_a_policy_needs_none_of_sb3s_layers() -> None:
-    check_training(small_model(vec_env(), OwnNames, policy_kwargs={}))
-
-
-def test_a_compiled_policy_trains(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Compiling switches the check of every distribution off, and for the whole process
-    monkeypatch.setattr(th.distributions.Distribution, "_validate_args", True)
-    model = small_model(vec_env())
-    model.policy = th.compile(model.policy, backend="eager")  # type: ignore[assignment]
-    check_training(model)
-
-
 def test_one_of_two_samples_is_not_few_enough_to_draw() -> None:
     """Batches of whole episodes may be smaller than `n_steps` promises."""
     model = small_model(vec_env(lambda: AnySpacesEnv(length=1), 2), n_episodes=1, sub_sampling_factor=2)
     assert train_once(model)["train/is_line_search_success"] == 1.0
-
-
-def test_values_of_weights_that_are_computed_from_others_have_no_running_scale() -> None:
-    model = small_model(vec_env())
-    nn.utils.parametrizations.weight_norm(model.policy.value_net)
-    check_training(model)
-    assert model.policy.value_net.scale == 1.0
-
-
-@pytest.mark.parametrize("where", ["policy", "extractor", "layer"])
-def test_methods_of_one_object_count_where_actions_are_drawn_and_where_they_are_judged(where: str) -> None:
-    model = small_model(vec_env())
-    policy = model.policy
-    owner, method = {
-        "policy": (policy, "_get_action_dist_from_latent"),
-        "extractor": (policy.mlp_extractor, "forward_actor"),
-        "layer": (policy.action_net, "forward"),
-    }[where]
-    original, calls = getattr(owner, method), []
-
-    def counted(*args: Any) -> Any:
-        calls.append(True)
-        return original(*args)
-
-    setattr(owner, method, counted)
-    train_once(model)
-    assert len(calls) > model.n_steps
 
 
 def test_values_of_sb3s_own_policy_class_have_no_running_scale() -> None:
