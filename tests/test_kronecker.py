@@ -11,13 +11,17 @@ from sb3_gae.update.conjugate_gradient import CGStatus, conjugate_gradient
 from sb3_gae.update.kronecker import KroneckerPreconditioner
 
 
-def network_of(sizes: list[int], n_samples: int, bias: bool = True) -> DenseNetwork:
-    """A tanh network in double precision over random inputs, with its activations."""
+def inputs_of(n_samples: int, n_inputs: int) -> th.Tensor:
+    return th.randn(n_samples, n_inputs, generator=th.Generator().manual_seed(0), dtype=th.double)
+
+
+def network_of(sizes: list[int], inputs: th.Tensor, bias: bool = True) -> DenseNetwork:
+    """A tanh network in double precision, with its activations."""
     th.manual_seed(0)
     layers: list[nn.Module] = []
     for n_in, n_out in itertools.pairwise(sizes):
         layers += [nn.Linear(n_in, n_out, bias=bias).double(), nn.Tanh()]
-    network = DenseNetwork(layers[:-1], th.randn(n_samples, sizes[0], dtype=th.double))
+    network = DenseNetwork(layers[:-1], inputs)
     network.forward()
     return network
 
@@ -36,7 +40,7 @@ def ones(network: DenseNetwork) -> th.Tensor:
 @pytest.mark.parametrize("bias", [True, False])
 @pytest.mark.parametrize(("scale", "damping"), [(1.0, 0.1), (7.0, 1e-3), (0.01, 2.0)])
 def test_is_the_exact_inverse_for_one_linear_layer(bias: bool, scale: float, damping: float) -> None:
-    network = network_of([4, 1], 50, bias)
+    network = network_of([4, 1], inputs_of(50, 4), bias)
     curvature = scale * dense_gauss_newton(network) + damping * th.eye(network.n_parameters, dtype=th.double)
     vector = th.randn(network.n_parameters, dtype=th.double)
     preconditioned = KroneckerPreconditioner(network, ones(network))(vector, scale, damping)
@@ -44,9 +48,9 @@ def test_is_the_exact_inverse_for_one_linear_layer(bias: bool, scale: float, dam
 
 
 def test_the_factors_of_a_layer_are_the_second_moments_of_its_inputs_and_of_its_cotangents() -> None:
-    network = network_of([3, 5, 1], 40)
+    inputs = inputs_of(40, 3)
+    network = network_of([3, 5, 1], inputs)
     (first, second) = network.layers
-    inputs = network.blocks[0]
     hidden = th.tanh(first[0](inputs)).detach()
     with_one = th.cat([inputs, th.ones(40, 1, dtype=th.double)], dim=1)
     cotangents = (1 - hidden**2) * second[0].weight.detach()
@@ -56,16 +60,16 @@ def test_the_factors_of_a_layer_are_the_second_moments_of_its_inputs_and_of_its_
 
 
 def test_several_blocks_give_the_factors_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = network_of([3, 5, 1], 40).kronecker_factors(th.ones(40, 1, dtype=th.double))
+    whole = network_of([3, 5, 1], inputs_of(40, 3)).kronecker_factors(th.ones(40, 1, dtype=th.double))
     monkeypatch.setattr("sb3_gae.networks.dense_network._BLOCK_ROWS", 7)
-    pieces = network_of([3, 5, 1], 40).kronecker_factors(th.ones(40, 1, dtype=th.double))
+    pieces = network_of([3, 5, 1], inputs_of(40, 3)).kronecker_factors(th.ones(40, 1, dtype=th.double))
     for layer, layer_in_pieces in zip(whole, pieces, strict=True):
         for factor, factor_in_pieces in zip(layer, layer_in_pieces, strict=True):
             th.testing.assert_close(factor, factor_in_pieces)
 
 
 def test_is_symmetric_and_positive_definite() -> None:
-    network = network_of([4, 6, 1], 60)
+    network = network_of([4, 6, 1], inputs_of(60, 4))
     precondition = KroneckerPreconditioner(network, ones(network))
     matrix = th.stack([precondition(row, 3.0, 0.01) for row in th.eye(network.n_parameters, dtype=th.double)])
     th.testing.assert_close(matrix, matrix.t())
@@ -73,9 +77,7 @@ def test_is_symmetric_and_positive_definite() -> None:
 
 
 def test_conjugate_gradient_finds_the_same_solution_with_it_and_is_nearer_after_a_few_steps() -> None:
-    network = network_of([8, 12, 1], 400)
-    network.blocks[0].mul_(th.logspace(-1, 1, 8, dtype=th.double))
-    network.forward()
+    network = network_of([8, 12, 1], inputs_of(400, 8) * th.logspace(-1, 1, 8, dtype=th.double))
     damping = 1e-3
     curvature = dense_gauss_newton(network) + damping * th.eye(network.n_parameters, dtype=th.double)
     gradient = network.vjp(th.randn(400, 1, dtype=th.double)) / 400

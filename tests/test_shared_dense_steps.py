@@ -137,9 +137,10 @@ def test_each_preconditioner_brings_a_few_products_nearer_to_the_solution(seed: 
 def test_the_preconditioner_of_one_layer_knows_what_another_network_adds() -> None:
     """Values and logits of one layer each, on the same features: the sum of their curvatures is inverted exactly."""
     policy = double_policy(ACTION_SPACES["Box"], net_arch=dict(pi=[3], vf=[]))
-    network = value_step.dense_value_network(policy, training_batch(policy).observations)
+    observations = training_batch(policy).observations
+    network = value_step.dense_value_network(policy, observations)
     network.forward()
-    features = th.cat([network.blocks[0], th.ones(network.batch_size, 1)], dim=1)
+    features = th.cat([policy.extract_features(observations), th.ones(network.batch_size, 1)], dim=1)
     curvature = features.t() @ features / network.batch_size
     (linear, _) = network.layers[0]
     preconditioner = KroneckerPreconditioner(network, th.ones(network.batch_size, 1).double(), {linear: th.tensor([[2.5]])})

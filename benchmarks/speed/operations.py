@@ -2,23 +2,25 @@ r"""
 How many operations the passes of an update are, as the matrix products that they consist of.
 
 A product of matrices of shapes (m, k) and (k, n) is :math:`2mkn` operations, a multiplication and an addition for each term.
-All else is left out: activations, sums over biases, vectors as long as the parameters, eigendecompositions. What comes out is
-thus a lower bound.
+All else is left out: activations, vectors as long as the parameters, eigendecompositions. What comes out is thus a lower
+bound.
 
-An MLP has layers :math:`h_l = f(h_{l-1} W_l^\top + b_l)` with :math:`n_{l-1}` inputs and :math:`n_l` outputs, over a batch of
-B rows. With :math:`S = \sum_l n_{l-1} n_l` over all layers, and :math:`S'` the same over all but the first:
+An MLP has layers :math:`h_l = f(W_l (h_{l-1}, 1))`, the bias the last column of the weights, with :math:`n_{l-1}` inputs and
+:math:`n_l` outputs, over a batch of B samples. With :math:`S = \sum_l (n_{l-1} + 1) n_l` over all layers, and
+:math:`T = \sum_l n_{l-1} n_l`, of weights alone, over all but the first:
 
-- *forward*: :math:`h_{l-1} W_l^\top` for each layer, :math:`2BS`;
-- *cotangents*, what an output's cotangents are further up: :math:`c_l W_l` for each layer but the first, whose inputs
-  are data, :math:`2BS'`;
-- *backward*, a product with the transposed Jacobian: the cotangents, and :math:`c_l^\top h_{l-1}` for each layer,
-  :math:`2B(S + S')`;
-- *tangents*, a product with the Jacobian: :math:`h_{l-1} \dot W_l^\top` for each layer, and :math:`\dot h_{l-1} W_l^\top` for
-  each but the first, whose inputs do not move, :math:`2B(S + S')`;
-- *curvature product*, Fisher or Gauss-Newton alike: tangents and backward, :math:`4B(S + S')`. The metric between the two
-  acts on each row alone;
-- *double backward*, the same by differentiating the gradient: of :math:`c_l^\top h_{l-1}` by both factors, of
-  :math:`c_l W_l` by both, and the backward pass through the forward one, :math:`2B(2S + 4S')`;
+- *forward*: :math:`W_l (h_{l-1}, 1)` for each layer, :math:`2BS`;
+- *cotangents*, what an output's cotangents are further up: :math:`W_l^\top c_l` for each layer but the first, whose inputs
+  are data, :math:`2BT`;
+- *backward*, a product with the transposed Jacobian: the cotangents, and :math:`c_l (h_{l-1}, 1)^\top` for each layer,
+  :math:`2B(S + T)`;
+- *tangents*, a product with the Jacobian: :math:`\dot W_l (h_{l-1}, 1)` for each layer, and :math:`W_l \dot h_{l-1}` for
+  each but the first, whose inputs do not move, :math:`2B(S + T)`;
+- *curvature product*, Fisher or Gauss-Newton alike: tangents and backward, :math:`4B(S + T)`. The metric between the two
+  acts on each sample alone;
+- *double backward*, the same by differentiating the gradient, as torch does it, whose biases are no part of matrix
+  products: of :math:`c_l h_{l-1}^\top` by both factors, of :math:`W_l^\top c_l` by both, and the backward pass through
+  the forward one, :math:`2B(2 \sum_l n_{l-1} n_l + 4T)`;
 - *Kronecker factors*: the cotangents, and for each layer the second moments of its inputs, with a 1 for the bias, and of the
   cotangents at its output, :math:`2B\sum_l ((n_{l-1}+1)^2 + n_l^2)`; to apply them takes for each layer two products
   from each side with a matrix of its weights' shape.
@@ -120,7 +122,7 @@ def forward(layers: Sequence[Layer], batch: int) -> Products:
     :param batch: rows
     :return: of a forward pass
     """
-    return Counter(Product(batch, *layer) for layer in layers)
+    return Counter(Product(n_out, n_in + 1, batch) for n_in, n_out in layers)
 
 
 def cotangents(layers: Sequence[Layer], batch: int) -> Products:
@@ -129,7 +131,7 @@ def cotangents(layers: Sequence[Layer], batch: int) -> Products:
     :param batch: rows
     :return: of the cotangents at each layer's output, from those at the last one's
     """
-    return Counter(Product(batch, layer.n_out, layer.n_in) for layer in layers[1:])
+    return Counter(Product(layer.n_in, layer.n_out, batch) for layer in layers[1:])
 
 
 def backward(layers: Sequence[Layer], batch: int) -> Products:
@@ -138,7 +140,7 @@ def backward(layers: Sequence[Layer], batch: int) -> Products:
     :param batch: rows
     :return: of a product with the transposed Jacobian by weights and biases
     """
-    return cotangents(layers, batch) + _by_weights(layers, batch)
+    return cotangents(layers, batch) + Counter(Product(n_out, batch, n_in + 1) for n_in, n_out in layers)
 
 
 def tangents(layers: Sequence[Layer], batch: int) -> Products:
@@ -147,7 +149,7 @@ def tangents(layers: Sequence[Layer], batch: int) -> Products:
     :param batch: rows
     :return: of a product with the Jacobian by weights and biases
     """
-    return forward(layers, batch) + forward(layers[1:], batch)
+    return forward(layers, batch) + _weights_alone(layers[1:], batch)
 
 
 def curvature_product(layers: Sequence[Layer], batch: int) -> Products:
@@ -165,13 +167,17 @@ def double_backward(layers: Sequence[Layer], batch: int) -> Products:
     :param batch: rows
     :return: of a product with the Hessian of a divergence by differentiating its gradient, whose graph is at hand
     """
-    of_weight_gradients = forward(layers, batch) + cotangents(layers, batch)
-    of_cotangents = forward(layers[1:], batch) + _by_weights(layers[1:], batch)
-    return of_weight_gradients + of_cotangents + backward(layers, batch)
+    of_weight_gradients = _weights_alone(layers, batch) + cotangents(layers, batch)
+    of_cotangents = _weights_alone(layers[1:], batch) + _gradients_alone(layers[1:], batch)
+    return of_weight_gradients + of_cotangents + cotangents(layers, batch) + _gradients_alone(layers, batch)
 
 
-def _by_weights(layers: Sequence[Layer], batch: int) -> Products:
-    return Counter(Product(layer.n_out, batch, layer.n_in) for layer in layers)
+def _weights_alone(layers: Iterable[Layer], batch: int) -> Products:
+    return Counter(Product(n_out, n_in, batch) for n_in, n_out in layers)
+
+
+def _gradients_alone(layers: Iterable[Layer], batch: int) -> Products:
+    return Counter(Product(n_out, batch, n_in) for n_in, n_out in layers)
 
 
 def kronecker_factors(layers: Sequence[Layer], batch: int) -> Products:

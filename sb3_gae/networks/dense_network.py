@@ -4,30 +4,22 @@ A multi-layer perceptron that keeps its activations, so that products with its J
 A curvature product in a trust-region step is :math:`J^\top M (J v)`: forward through the linearised network, a metric on
 its outputs, and backward. Within one conjugate-gradient solve neither the parameters nor the inputs change,
 so the activations are computed once. Double backward computes them again for every product.
+
+Inside, matrices have a unit in each row and a sample in each column, and a row of ones is under each layer's inputs as its
+biases are beside its weights (:mod:`~sb3_gae.networks.joined_layers`). Adding a bias, its tangent, its gradient and its row of
+the second moments are then part of a matrix product, instead of a pass over memory each; and all but the ones is contiguous.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import torch as th
 from torch import nn
 
-from sb3_gae.networks.layers import activate, pair_up
-from sb3_gae.networks.parameters import unflatten
+from sb3_gae.networks.activations import activate_, is_known, times_derivative_
+from sb3_gae.networks.joined_layers import joined_columns, joined_parameters, joined_pieces, joined_zeros, separated
+from sb3_gae.networks.layers import pair_up
 
-_aten = th.ops.aten
-
-# Tangents times the derivative of an activation, given its *output*; only activations for which that is enough are here.
-# The fused kernels of torch's own backward pass read each array once
-_TIMES_DERIVATIVE: dict[type[nn.Module], Callable[[Any, th.Tensor, th.Tensor], th.Tensor]] = {
-    nn.Tanh: lambda _, tangents, h: _aten.tanh_backward(tangents, h),
-    nn.Sigmoid: lambda _, tangents, h: _aten.sigmoid_backward(tangents, h),
-    nn.ReLU: lambda _, tangents, h: _aten.threshold_backward(tangents, h, 0),
-    nn.LeakyReLU: lambda module, tangents, h: _aten.leaky_relu_backward(tangents, h, module.negative_slope, True),
-    nn.ELU: lambda module, tangents, h: _aten.elu_backward(tangents, module.alpha, 1, 1, True, h),
-}
-
-# Rows that go through all layers together: few enough to stay in the cache, enough to keep the cores busy
+# Samples that go through all layers together: few enough to stay in the cache, enough to keep the cores busy
 _BLOCK_ROWS = 8192
 
 
@@ -36,15 +28,15 @@ class DenseNetwork:
     Layers of an MLP over a fixed batch of inputs.
 
     :param layers: alternating :class:`torch.nn.Linear` and activations, as :meth:`supports` accepts them
-    :param inputs: shape (B, n_in); not copied
+    :param inputs: shape (B, n_in); copied
     """
 
     def __init__(self, layers: Sequence[nn.Module], inputs: th.Tensor):
         self.layers = pair_up(layers)
-        self.blocks = inputs.split(_BLOCK_ROWS)
         self.batch_size = len(inputs)
-        # For each block the input of each layer, and last the output of the network
-        self._hidden: list[list[th.Tensor]] = []
+        self._linears = [linear for linear, _ in self.layers]
+        # For each block the input of each layer, with ones for its bias, and last the output of the network
+        self._hidden = [self._room(block) for block in inputs.split(_BLOCK_ROWS)]
 
     @staticmethod
     def supports(layers: Sequence[nn.Module]) -> bool:
@@ -57,7 +49,7 @@ class DenseNetwork:
         pairs = pair_up(layers)
         return (
             bool(pairs)
-            and all(type(linear) is nn.Linear and (act is None or type(act) in _TIMES_DERIVATIVE) for linear, act in pairs)
+            and all(type(linear) is nn.Linear and (act is None or is_known(act)) for linear, act in pairs)
             and not any(layer._forward_hooks or layer._forward_pre_hooks for layer in layers)
             and all(parameter.requires_grad for parameter in parameters)
             and len({id(parameter) for parameter in parameters}) == len(parameters)
@@ -66,12 +58,22 @@ class DenseNetwork:
     @property
     def parameters(self) -> list[nn.Parameter]:
         """Weights and biases, in the order of the vectors that :meth:`jvp` takes and :meth:`vjp` returns."""
-        return [parameter for linear, _ in self.layers for parameter in linear.parameters()]
+        return [parameter for linear in self._linears for parameter in linear.parameters()]
 
     @property
     def n_parameters(self) -> int:
         """Number of scalars in :attr:`parameters`."""
         return sum(parameter.numel() for parameter in self.parameters)
+
+    def _room(self, inputs: th.Tensor) -> list[th.Tensor]:
+        """Inputs of a block with ones for the biases, and where what they become is to go."""
+        first = inputs.new_empty(len(inputs), joined_columns(self._linears[0]))
+        first[:, : inputs.shape[1]] = inputs
+        rows = [joined_columns(linear) for linear in self._linears[1:]] + [self._linears[-1].out_features]
+        room = [first.t(), *(inputs.new_empty(n_rows, len(inputs)) for n_rows in rows)]
+        for hidden, linear in zip(room, self._linears, strict=False):
+            hidden[linear.in_features :] = 1.0
+        return room
 
     @th.no_grad()
     def forward(self) -> th.Tensor:
@@ -80,21 +82,23 @@ class DenseNetwork:
 
         :return: outputs, shape (B, n_out)
         """
-        self._hidden = [self._forward_block(block) for block in self.blocks]
-        return th.cat([hidden[-1] for hidden in self._hidden])
+        weights = joined_parameters(self._linears)
+        for hidden in self._hidden:
+            for layer, (_, activation) in enumerate(self.layers):
+                outputs = self._outputs(hidden, layer)
+                th.mm(weights[layer], hidden[layer], out=outputs)
+                if activation is not None:
+                    activate_(activation, outputs)
+        return th.cat([hidden[-1].t() for hidden in self._hidden])
 
-    def _forward_block(self, inputs: th.Tensor) -> list[th.Tensor]:
-        hidden = [inputs]
-        for linear, activation in self.layers:
-            outputs = linear(hidden[-1])
-            hidden.append(outputs if activation is None else activate(activation, outputs))
-        return hidden
+    def _outputs(self, hidden: list[th.Tensor], layer: int) -> th.Tensor:
+        """Without the ones for the bias of the next."""
+        return hidden[layer + 1][: self._linears[layer].out_features]
 
-    def _times_derivative(self, index: int, layer: int, tangents: th.Tensor) -> th.Tensor:
+    def _times_derivative_(self, index: int, layer: int, tangents: th.Tensor) -> None:
         activation = self.layers[layer][1]
-        if activation is None:
-            return tangents
-        return _TIMES_DERIVATIVE[type(activation)](activation, tangents, self._hidden[index][layer + 1])
+        if activation is not None:
+            times_derivative_(activation, tangents, self._outputs(self._hidden[index], layer))
 
     @th.no_grad()
     def vjp(self, cotangents: th.Tensor) -> th.Tensor:
@@ -102,11 +106,10 @@ class DenseNetwork:
         :param cotangents: one for each output, shape (B, n_out)
         :return: the Jacobian's transpose times ``cotangents``, summed over the batch, shape (n,)
         """
-        result = cotangents.new_zeros(self.n_parameters)
-        gradients = list(self._split(result))
+        gradients = joined_zeros(self._linears)
         for index, block in enumerate(cotangents.split(_BLOCK_ROWS)):
             self._accumulate_vjp(index, block, gradients)
-        return result
+        return separated(self._linears, gradients)
 
     @th.no_grad()
     def gauss_newton_product(self, vector: th.Tensor, metric: Callable[[th.Tensor, slice], th.Tensor]) -> th.Tensor:
@@ -117,12 +120,11 @@ class DenseNetwork:
         :param metric: applies :math:`M` to a block of output tangents, given with the slice of rows that it holds
         :return: shape (n,)
         """
-        result = th.zeros_like(vector)
-        tangents, gradients = list(self._split(vector)), list(self._split(result))
-        for index, block in enumerate(self.blocks):
-            rows = slice(index * _BLOCK_ROWS, index * _BLOCK_ROWS + len(block))
-            self._accumulate_vjp(index, metric(self._jvp_block(index, tangents), rows), gradients)
-        return result
+        tangents, gradients = joined_pieces(self._linears, vector), joined_zeros(self._linears)
+        for index, hidden in enumerate(self._hidden):
+            rows = slice(index * _BLOCK_ROWS, index * _BLOCK_ROWS + hidden[0].shape[1])
+            self._accumulate_vjp(index, metric(self._jvp_block(index, tangents).t(), rows), gradients)
+        return separated(self._linears, gradients)
 
     @th.no_grad()
     def kronecker_factors(self, cotangents: th.Tensor) -> list[tuple[th.Tensor, th.Tensor]]:
@@ -136,9 +138,7 @@ class DenseNetwork:
         factors: dict[int, tuple[th.Tensor, th.Tensor]] = {}
         for index, block in enumerate(cotangents.split(_BLOCK_ROWS)):
             for layer, hidden, at_layer in self._backward(index, block):
-                if self.layers[layer][0].bias is not None:
-                    hidden = th.cat([hidden, hidden.new_ones(len(hidden), 1)], dim=1)
-                moments = hidden.t() @ hidden / self.batch_size, at_layer.t() @ at_layer / self.batch_size
+                moments = hidden @ hidden.t() / self.batch_size, at_layer @ at_layer.t() / self.batch_size
                 before = factors.get(layer, (0.0, 0.0))
                 factors[layer] = (before[0] + moments[0], before[1] + moments[1])
         return [factors[layer] for layer in range(len(self.layers))]
@@ -149,35 +149,31 @@ class DenseNetwork:
         :param vector: a direction in parameter space, shape (n,)
         :return: how the outputs move along it, shape (B, n_out)
         """
-        tangents = list(self._split(vector))
-        return th.cat([self._jvp_block(index, tangents) for index in range(len(self.blocks))])
+        tangents = joined_pieces(self._linears, vector)
+        return th.cat([self._jvp_block(index, tangents).t() for index in range(len(self._hidden))])
 
-    def _jvp_block(self, index: int, tangents: list[tuple[th.Tensor, th.Tensor | None]]) -> th.Tensor:
+    def _jvp_block(self, index: int, tangents: list[th.Tensor]) -> th.Tensor:
         tangent = th.empty(0)
-        for layer, (weight, bias) in enumerate(tangents):
-            hidden = self._hidden[index][layer]
-            moved = hidden @ weight.t() if bias is None else th.addmm(bias, hidden, weight.t())
+        for layer, weights in enumerate(tangents):
+            moved = weights @ self._hidden[index][layer]
             if layer > 0:
-                moved.addmm_(tangent, self.layers[layer][0].weight.t())
-            tangent = self._times_derivative(index, layer, moved)
+                moved.addmm_(self._linears[layer].weight, tangent)
+            self._times_derivative_(index, layer, moved)
+            tangent = moved
         return tangent
 
-    def _accumulate_vjp(self, index: int, cotangent: th.Tensor, gradients: list[tuple[th.Tensor, th.Tensor | None]]) -> None:
-        for layer, hidden, at_layer in self._backward(index, cotangent):
-            weight, bias = gradients[layer]
-            weight.addmm_(at_layer.t(), hidden)
-            if bias is not None:
-                bias.add_(at_layer.sum(0))
+    def _accumulate_vjp(self, index: int, cotangents: th.Tensor, gradients: list[th.Tensor]) -> None:
+        for layer, hidden, at_layer in self._backward(index, cotangents):
+            gradients[layer].addmm_(at_layer, hidden.t())
 
-    def _backward(self, index: int, cotangent: th.Tensor) -> Iterator[tuple[int, th.Tensor, th.Tensor]]:
-        """Each linear layer of a block from the last to the first, with its inputs and the cotangents at its output."""
+    def _backward(self, index: int, cotangents: th.Tensor) -> Iterator[tuple[int, th.Tensor, th.Tensor]]:
+        """
+        Each linear layer of a block from the last to the first, with its inputs, ones included, and the cotangents at its
+        output.
+        """
+        at_layer = cotangents.t().clone(memory_format=th.contiguous_format)
         for layer in range(len(self.layers) - 1, -1, -1):
-            cotangent = self._times_derivative(index, layer, cotangent)
-            yield layer, self._hidden[index][layer], cotangent
+            self._times_derivative_(index, layer, at_layer)
+            yield layer, self._hidden[index][layer], at_layer
             if layer > 0:
-                cotangent = cotangent @ self.layers[layer][0].weight
-
-    def _split(self, vector: th.Tensor) -> Iterator[tuple[th.Tensor, th.Tensor | None]]:
-        pieces = (piece for _, piece in unflatten(self.parameters, vector))
-        for linear, _ in self.layers:
-            yield next(pieces), None if linear.bias is None else next(pieces)
+                at_layer = self._linears[layer].weight.t() @ at_layer

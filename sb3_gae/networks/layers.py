@@ -1,4 +1,4 @@
-"""Layers of MLPs one by one: which activation follows which linear layer, a faster tanh, and few rows at a time."""
+"""Layers of MLPs one by one: which activation follows which linear layer, and few rows at a time."""
 
 from collections.abc import Sequence
 
@@ -9,20 +9,6 @@ from torch import nn
 # Multiplications of a product up to which NumPy's BLAS, OpenBLAS, keeps to one thread by itself. Its others would wait by
 # spinning on the cores that step the physics
 _ONE_THREAD = 2**18
-
-
-def activate(activation: nn.Module, outputs: th.Tensor) -> th.Tensor:
-    """
-    :param activation: of a layer
-    :param outputs: of that layer before it; fresh, since they may be overwritten, and without a graph
-    :return: after it
-    """
-    if type(activation) is not nn.Tanh or outputs.device.type != "cpu" or outputs.dtype not in (th.float32, th.float64):
-        return activation(outputs)
-    # NumPy's kernel takes a fraction of the time of torch's, which would be the largest cost of a pass
-    array = outputs.numpy()
-    np.tanh(array, out=array)
-    return outputs
 
 
 def pair_up(layers: Sequence[nn.Module]) -> list[tuple[nn.Linear, nn.Module | None]]:

@@ -13,6 +13,7 @@ import torch as th
 from torch import nn
 
 from sb3_gae.networks.dense_network import DenseNetwork
+from sb3_gae.networks.joined_layers import joined_pieces, separated
 
 #: second moments of cotangents at the outputs of linear layers, shapes (n_out, n_out)
 OutputMoments = Mapping[nn.Module, th.Tensor]
@@ -58,21 +59,14 @@ class KroneckerPreconditioner:
         :param damping: :math:`d`, positive
         :return: shape (n,)
         """
-        pieces, start = [], 0
-        for linear, ((input_values, input_vectors), (output_values, output_vectors)) in zip(
-            self._layers, self._eigen, strict=True
+        solved = []
+        for matrix, ((input_values, input_vectors), (output_values, output_vectors)) in zip(
+            joined_pieces(self._layers, vector), self._eigen, strict=True
         ):
-            size, columns = linear.weight.numel(), linear.in_features
-            matrix = vector[start : start + size].view_as(linear.weight)
-            start += size
-            if linear.bias is not None:
-                matrix = th.cat([matrix, vector[start : start + linear.out_features, None]], dim=1)
-                start += linear.out_features
             rotated = output_vectors.t() @ matrix @ input_vectors
             rotated /= scale * output_values[:, None] * input_values + damping
-            solved = output_vectors @ rotated @ input_vectors.t()
-            pieces += [solved[:, :columns].reshape(-1), solved[:, columns:].reshape(-1)]
-        return th.cat(pieces)
+            solved.append(output_vectors @ rotated @ input_vectors.t())
+        return separated(self._layers, solved)
 
 
 def _eigh(matrix: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -1,7 +1,7 @@
 """The policy step: TRPO's natural gradient with an exact radius and a search on the true divergence."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch as th
@@ -63,8 +63,8 @@ def policy_step(
 class _SurrogateAndDivergence:
     """Surrogate and mean KL divergence of the policy as it now is, from the policy as it was."""
 
-    policy: ActorCriticPolicy
-    batch: TrainingBatch
+    distribution: Callable[[], Distribution]
+    actions: th.Tensor
     advantages: th.Tensor
     old: Distribution
     old_log_prob: th.Tensor
@@ -72,8 +72,8 @@ class _SurrogateAndDivergence:
     def __call__(self) -> tuple[float, float]:
         try:
             with th.no_grad():
-                new = self.policy.get_distribution(self.batch.observations)
-                surrogate = _surrogate(self.advantages, new.log_prob(self.batch.actions), self.old_log_prob)
+                new = self.distribution()
+                surrogate = _surrogate(self.advantages, new.log_prob(self.actions), self.old_log_prob)
                 return surrogate.item(), mean_kl(self.old, new).item()
         except ValueError:
             # torch refuses distribution parameters that are not finite: too long a step, not an error of the user's. Where
@@ -93,18 +93,21 @@ def _autograd_problem(
     curvature_batch: TrainingBatch,
 ) -> LocalProblem:
     """For any policy that can be differentiated twice."""
+
+    def distribution() -> Distribution:
+        return policy.get_distribution(batch.observations)
+
     with th.no_grad():
-        old = snapshot(policy.get_distribution(batch.observations))
+        old = snapshot(distribution())
         old_log_prob = old.log_prob(batch.actions)
-    log_prob = policy.get_distribution(batch.observations).log_prob(batch.actions)
-    surrogate = _surrogate(advantages, log_prob, old_log_prob)
+    surrogate = _surrogate(advantages, distribution().log_prob(batch.actions), old_log_prob)
     return LocalProblem(
         name="policy",
         parameters=parameters,
         objective=surrogate.item(),
         gradient=flat_gradient(surrogate, parameters),
         curvature=autograd_fisher_product(policy, parameters, curvature_batch.observations),
-        evaluate=_SurrogateAndDivergence(policy, batch, advantages, old, old_log_prob),
+        evaluate=_SurrogateAndDivergence(distribution, batch.actions, advantages, old, old_log_prob),
     )
 
 
@@ -117,12 +120,16 @@ def _dense_problem(
 ) -> LocalProblem:
     """The same for an MLP, several times as fast."""
     network, log_std = dense_policy_network(policy, batch.observations), policy_log_std(policy)
+
+    def distribution(outputs: th.Tensor | None = None) -> Distribution:
+        outputs = network.forward() if outputs is None else outputs
+        return distribution_from_outputs(policy.action_dist, outputs, log_std)
+
     outputs = network.forward()
     with th.no_grad():
-        old = snapshot(distribution_from_outputs(policy.action_dist, outputs, log_std))
-        old_log_prob = old.log_prob(batch.actions)
-    log_prob = distribution_from_outputs(policy.action_dist, outputs.requires_grad_(), log_std).log_prob(batch.actions)
-    surrogate = _surrogate(advantages, log_prob, old_log_prob)
+        old = snapshot(distribution(outputs))
+    log_prob = distribution(outputs.requires_grad_()).log_prob(batch.actions)
+    surrogate = _surrogate(advantages, log_prob, log_prob.detach())
     fisher = DenseFisher(policy, curvature_batch.observations)
     cotangents, *log_std_gradient = th.autograd.grad(surrogate, [outputs, *log_std])
     return LocalProblem(
@@ -132,7 +139,7 @@ def _dense_problem(
         gradient=th.cat([network.vjp(cotangents), *log_std_gradient]),
         curvature=fisher.product,
         precondition=fisher.precondition if fisher.prepare(curvature_batch.actions) else None,
-        evaluate=_SurrogateAndDivergence(policy, batch, advantages, old, old_log_prob),
+        evaluate=_SurrogateAndDivergence(distribution, batch.actions, advantages, old, log_prob.detach()),
     )
 
 

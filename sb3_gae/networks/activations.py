@@ -1,0 +1,80 @@
+"""Activations in place, and their derivatives from what came out: only those for which that is enough are here."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from torch import nn
+from torch.nn import functional
+
+_aten = th.ops.aten
+
+
+class _Activation(NamedTuple):
+    """
+    :param apply: to what a layer puts out, given with the module, in place
+    :param times_derivative: multiplies tangents, in place, given with the module and what came out
+    """
+
+    apply: Callable[[Any, th.Tensor], object]
+    times_derivative: Callable[[Any, th.Tensor, th.Tensor], object]
+
+
+def _tanh_(_: nn.Tanh, outputs: th.Tensor) -> None:
+    if outputs.device.type != "cpu" or outputs.dtype not in (th.float32, th.float64):
+        outputs.tanh_()
+        return
+    # NumPy's kernel takes a fraction of the time of torch's, which would be the largest cost of a pass
+    array = outputs.numpy()
+    np.tanh(array, out=array)
+
+
+# The fused kernels of torch's own backward pass read each array once
+_KNOWN: dict[type[nn.Module], _Activation] = {
+    nn.Tanh: _Activation(
+        _tanh_,
+        lambda _, t, h: _aten.tanh_backward.grad_input(t, h, grad_input=t),
+    ),
+    nn.Sigmoid: _Activation(
+        lambda _, x: x.sigmoid_(),
+        lambda _, t, h: _aten.sigmoid_backward.grad_input(t, h, grad_input=t),
+    ),
+    nn.ReLU: _Activation(
+        lambda _, x: x.relu_(),
+        lambda _, t, h: _aten.threshold_backward.grad_input(t, h, 0, grad_input=t),
+    ),
+    nn.LeakyReLU: _Activation(
+        lambda module, x: functional.leaky_relu_(x, module.negative_slope),
+        lambda module, t, h: _aten.leaky_relu_backward.grad_input(t, h, module.negative_slope, True, grad_input=t),
+    ),
+    nn.ELU: _Activation(
+        lambda module, x: functional.elu_(x, module.alpha),
+        lambda module, t, h: _aten.elu_backward.grad_input(t, module.alpha, 1, 1, True, h, grad_input=t),
+    ),
+}
+
+
+def is_known(activation: nn.Module) -> bool:
+    """
+    :param activation: any module
+    :return: whether the others here know it; a subclass may do something else
+    """
+    return type(activation) in _KNOWN
+
+
+def activate_(activation: nn.Module, outputs: th.Tensor) -> None:
+    """
+    :param activation: one that :func:`is_known`
+    :param outputs: of a layer before it, without a graph; overwritten by those after it
+    """
+    _KNOWN[type(activation)].apply(activation, outputs)
+
+
+def times_derivative_(activation: nn.Module, tangents: th.Tensor, activated: th.Tensor) -> None:
+    """
+    :param activation: one that :func:`is_known`
+    :param tangents: overwritten by their product with the derivative
+    :param activated: what came out of the activation, of the same shape
+    """
+    _KNOWN[type(activation)].times_derivative(activation, tangents, activated)
