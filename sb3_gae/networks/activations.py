@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch as th
 from torch import nn
 from torch.nn import functional
@@ -21,19 +20,10 @@ class _Activation(NamedTuple):
     times_derivative: Callable[[Any, th.Tensor, th.Tensor], object]
 
 
-def _tanh_(_: nn.Tanh, outputs: th.Tensor) -> None:
-    if outputs.device.type != "cpu" or outputs.dtype not in (th.float32, th.float64):
-        outputs.tanh_()
-        return
-    # NumPy's kernel takes a fraction of the time of torch's, which would be the largest cost of a pass
-    array = outputs.numpy()
-    np.tanh(array, out=array)
-
-
 # The fused kernels of torch's own backward pass read each array once
 _KNOWN: dict[type[nn.Module], _Activation] = {
     nn.Tanh: _Activation(
-        _tanh_,
+        lambda _, x: x.tanh_(),
         lambda _, t, h: _aten.tanh_backward.grad_input(t, h, grad_input=t),
     ),
     nn.Sigmoid: _Activation(

@@ -16,7 +16,7 @@ from torch import nn
 
 from sb3_gae.batch import in_chunks
 from sb3_gae.networks.dense_network import DenseNetwork
-from sb3_gae.networks.distributions import FISHER_METRICS
+from sb3_gae.networks.distributions import is_known
 from sb3_gae.networks.value_head import ValueHead
 
 
@@ -28,7 +28,7 @@ def has_dense_policy(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor])
     """
     return (
         _inherits(policy, "get_distribution", "extract_features", "_get_action_dist_from_latent")
-        and type(policy.action_dist) in FISHER_METRICS
+        and is_known(policy.action_dist)
         and _hold_exactly(_policy_layers(policy), policy_log_std(policy), parameters)
     )
 

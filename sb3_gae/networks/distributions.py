@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import torch as th
 from stable_baselines3.common.distributions import (
@@ -14,10 +14,15 @@ from stable_baselines3.common.distributions import (
     kl_divergence,
 )
 
+from sb3_gae.networks.diagonal_gaussian import DiagonalGaussian
+
 OutputMetric = Callable[[th.Tensor, slice], th.Tensor]
+#: over the actions of a batch: one of SB3's, or the one here that stands in for it
+ActionDistribution = Distribution | DiagonalGaussian
+AnyDistribution = TypeVar("AnyDistribution", bound=ActionDistribution)
 
 
-def snapshot(distribution: Distribution) -> Distribution:
+def snapshot(distribution: AnyDistribution) -> AnyDistribution:
     """
     SB3 policies own one distribution object and refill it at every call; this one stays as it is now.
 
@@ -27,7 +32,7 @@ def snapshot(distribution: Distribution) -> Distribution:
     return copy.copy(distribution)
 
 
-def mean_kl(old: Distribution, new: Distribution) -> th.Tensor:
+def mean_kl(old: ActionDistribution, new: ActionDistribution) -> th.Tensor:
     r"""
     Mean over the batch of :math:`D_{KL}(\pi_{old} \| \pi_{new})`, summed over independent action dimensions.
 
@@ -35,25 +40,36 @@ def mean_kl(old: Distribution, new: Distribution) -> th.Tensor:
     :param new: likewise
     :return: a scalar, in nats
     """
-    divergence = kl_divergence(old, new)
+    if isinstance(old, DiagonalGaussian) and isinstance(new, DiagonalGaussian):
+        return old.mean_kl(new)
+    divergence = kl_divergence(cast(Distribution, old), cast(Distribution, new))
     return divergence.reshape(len(divergence), -1).sum(dim=1).mean()
 
 
-def distribution_from_outputs(distribution: Distribution, outputs: th.Tensor, log_std: Sequence[th.Tensor]) -> Distribution:
+def is_known(distribution: Distribution) -> bool:
     """
-    Refill a distribution from the outputs of the last layer.
+    :param distribution: a policy's ``action_dist``
+    :return: whether its Fisher metric is known in closed form; a subclass may be something else
+    """
+    return type(distribution) in {DiagGaussianDistribution, *_FISHER_METRICS}
 
-    :param distribution: one of :data:`FISHER_METRICS`
-    :param outputs: means or logits, shape (B, n_out)
-    :param log_std: for a Gaussian, one tensor of shape (n_actions,); nothing for the others
-    :return: ``distribution`` itself
+
+def distribution_from_outputs(
+    distribution: Distribution, outputs: th.Tensor, log_std: Sequence[th.Tensor]
+) -> ActionDistribution:
     """
+    :param distribution: a policy's ``action_dist`` that :func:`is_known`; refilled, unless it is a Gaussian
+    :param outputs: means or logits of the last layer, shape (B, n_out)
+    :param log_std: for a Gaussian, one tensor of shape (n_actions,); nothing for the others
+    :return: the distribution with these outputs
+    """
+    if type(distribution) is DiagGaussianDistribution:
+        return DiagonalGaussian(outputs, *log_std)
     return distribution.proba_distribution(outputs, *log_std)
 
 
-def _gaussian_metric(distribution: DiagGaussianDistribution) -> OutputMetric:
-    # The standard deviation is a parameter of its own and the same in each state
-    precision = distribution.distribution.stddev[0].pow(-2)
+def _gaussian_metric(distribution: DiagonalGaussian) -> OutputMetric:
+    precision = distribution.precision
     return lambda tangents, rows: tangents * precision
 
 
@@ -84,23 +100,22 @@ def _softmax_metric(tangents: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
     return weighted - probabilities * weighted.sum(dim=1, keepdim=True)
 
 
-#: Distributions whose Fisher metric is known in closed form
-FISHER_METRICS: dict[type[Distribution], Callable[[Any], OutputMetric]] = {
-    DiagGaussianDistribution: _gaussian_metric,
+_FISHER_METRICS: dict[type, Callable[[Any], OutputMetric]] = {
+    DiagonalGaussian: _gaussian_metric,
     CategoricalDistribution: _categorical_metric,
     MultiCategoricalDistribution: _multi_categorical_metric,
     BernoulliDistribution: _bernoulli_metric,
 }
 
 
-def fisher_metric(distribution: Distribution) -> OutputMetric:
+def fisher_metric(distribution: ActionDistribution) -> OutputMetric:
     r"""
     Fisher information of a distribution in the coordinates of its last layer: :math:`M` in :math:`J^\top M J`.
 
     Gaussian means: :math:`1/\sigma^2`. Logits of a categorical: :math:`\mathrm{diag}(p) - pp^\top`.
     Logits of a Bernoulli: :math:`p(1-p)`.
 
-    :param distribution: one of :data:`FISHER_METRICS`, filled for the batch without a graph
+    :param distribution: of :func:`distribution_from_outputs`, without a graph
     :return: applies :math:`M` to the output tangents of a slice of the batch
     """
-    return FISHER_METRICS[type(distribution)](distribution)
+    return _FISHER_METRICS[type(distribution)](distribution)

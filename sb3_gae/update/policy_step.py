@@ -5,13 +5,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch as th
-from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.networks.dense_policy import dense_policy_network, has_dense_policy, policy_log_std
-from sb3_gae.networks.distributions import distribution_from_outputs, fisher_metric, mean_kl, snapshot
+from sb3_gae.networks.distributions import ActionDistribution, distribution_from_outputs, fisher_metric, mean_kl, snapshot
 from sb3_gae.networks.parameters import flat_gradient, influencing_in_batch, influencing_parameters
 from sb3_gae.update.curvature import CurvatureProduct, hessian_product
 from sb3_gae.update.kronecker import KroneckerPreconditioner, OutputMoments
@@ -63,10 +62,10 @@ def policy_step(
 class _SurrogateAndDivergence:
     """Surrogate and mean KL divergence of the policy as it now is, from the policy as it was."""
 
-    distribution: Callable[[], Distribution]
+    distribution: Callable[[], ActionDistribution]
     actions: th.Tensor
     advantages: th.Tensor
-    old: Distribution
+    old: ActionDistribution
     old_log_prob: th.Tensor
 
     def __call__(self) -> tuple[float, float]:
@@ -94,7 +93,7 @@ def _autograd_problem(
 ) -> LocalProblem:
     """For any policy that can be differentiated twice."""
 
-    def distribution() -> Distribution:
+    def distribution() -> ActionDistribution:
         return policy.get_distribution(batch.observations)
 
     with th.no_grad():
@@ -121,7 +120,7 @@ def _dense_problem(
     """The same for an MLP, several times as fast."""
     network, log_std = dense_policy_network(policy, batch.observations), policy_log_std(policy)
 
-    def distribution(outputs: th.Tensor | None = None) -> Distribution:
+    def distribution(outputs: th.Tensor | None = None) -> ActionDistribution:
         outputs = network.forward() if outputs is None else outputs
         return distribution_from_outputs(policy.action_dist, outputs, log_std)
 
