@@ -70,7 +70,7 @@ class Plant(NamedTuple):
 
 #: by name
 PLANTS = {
-    "doubled-cg": Plant(doubled_conjugate_gradient, "speed", ("update / sb3-contrib's", "value fit / passes")),
+    "doubled-cg": Plant(doubled_conjugate_gradient, "speed", ("value fit / passes",)),
     "doubled-actions": Plant(doubled_actions, "speed", ("actions / policy's own",)),
     "wrong-sign": Plant(wrong_sign, "learning", tuple(RUNS)),
     "value-first": Plant(value_first, "learning", ("HalfCheetah-v5, close fit",)),

@@ -18,7 +18,7 @@ from benchmarks.speed.plan import Plan, plan
 
 #: seconds before each call, in which the threads of the call before stop spinning
 PAUSE = 0.3
-ROUNDS, QUICK_ROUNDS = 15, 2
+ROUNDS, QUICK_ROUNDS = 31, 2
 
 
 class Target(NamedTuple):
