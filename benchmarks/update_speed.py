@@ -77,10 +77,10 @@ class NoisyOscillators(gym.Env):
         return np.concatenate([self._state.real, self._state.imag])[:N_STATES].astype(np.float32)
 
 
-def ours(batch_size: int, networks: dict[str, Any] = LOCOMOTION_NETWORKS) -> TRPOGAE:
+def ours(batch_size: int, networks: dict[str, Any] = LOCOMOTION_NETWORKS, seed: int = 0) -> TRPOGAE:
     """A model that has collected one rollout and not yet learned from it."""
-    env = make_vec_env(NoisyOscillators, N_ENVS, seed=0)
-    model = TRPOGAE("MlpPolicy", env, n_steps=batch_size // N_ENVS, policy_kwargs=networks, seed=0, device="cpu")
+    env = make_vec_env(NoisyOscillators, N_ENVS, seed=seed)
+    model = TRPOGAE("MlpPolicy", env, n_steps=batch_size // N_ENVS, policy_kwargs=networks, seed=seed, device="cpu")
     _, callback = model._setup_learn(batch_size)
     callback.on_training_start(locals(), globals())
     model.collect_rollouts(env, callback, model.rollout_buffer, model.n_steps)

@@ -7,15 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch as th
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import benchmarks.gate.__main__ as gate
-from benchmarks.gate.bands import LEARNING_DEVIATIONS, SPEED_MARGIN, Band, learning_band, speed_band, verdicts
+import benchmarks.gate.parts as gate_parts
+from benchmarks.gate.bands import LEARNING_DEVIATIONS, Band, cost_band, learning_band, verdicts
 from benchmarks.gate.learning import RUNS, SEEDS
+from benchmarks.gate.parts import PARTS, Part, record_speed, speed_bands
 from benchmarks.gate.plants import PLANTS, Plant, twice
-from benchmarks.gate.records import bands, read_records
+from benchmarks.gate.records import read_records
 from benchmarks.gate.speed import ROLLOUT_TASKS
+from benchmarks.gate.work import COUNTS, SEED, counted
 
 
 def test_a_band_for_learning_reaches_as_far_as_the_error_of_two_means() -> None:
@@ -35,19 +39,41 @@ def test_unchanged_learning_stays_in_its_band_and_a_shift_of_six_errors_does_not
     assert np.mean(shifted) < 0.05
 
 
-def test_a_band_for_speed_has_no_lower_end() -> None:
-    band = speed_band([0.9, 1.0, 0.8])
-    assert band == Band(0.0, SPEED_MARGIN)
+def test_a_band_for_a_cost_has_no_lower_end() -> None:
+    band = cost_band([0.9, 1.0, 0.8], margin=1.15)
+    assert band == Band(0.0, 1.15)
     assert band.holds(0.1)
     assert not band.holds(1.2)
     assert not band.holds(math.nan)
+
+
+def test_speed_is_judged_by_what_is_recorded_of_its_kind_of_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    recorded = {"one": {"ratio": [1.0, 2.0]}, "other": {"ratio": [4.0, 3.0], "new": [1.0]}}
+    monkeypatch.setattr(gate_parts, "processor", lambda: "one")
+    assert speed_bands(recorded) == {"ratio": Band(0.0, pytest.approx(2.3))}
+    monkeypatch.setattr(gate_parts, "processor", lambda: "a third")
+    assert speed_bands(recorded) == {"ratio": Band(0.0, 6.0), "new": Band(0.0, 1.5)}
+
+
+def test_recording_speed_keeps_what_was_recorded_of_other_processors(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate_parts, "processor", lambda: "one")
+    monkeypatch.setattr(gate_parts, "speed_ratios", lambda: {"ratio": 0.5})
+    before = {"one": {"ratio": [9.0]}, "other": {"ratio": [4.0]}}
+    assert record_speed(before) == {"one": {"ratio": [0.5] * gate_parts.RECORDED_ROUNDS}, "other": {"ratio": [4.0]}}
+    assert record_speed(None) == {"one": {"ratio": [0.5] * gate_parts.RECORDED_ROUNDS}}
+
+
+def test_arithmetic_of_products_and_calls_of_operators_are_counted() -> None:
+    first, second = th.ones(3, 4), th.ones(4, 5)
+    assert counted(lambda: th.tanh(first @ second)) == (2 * 3 * 4 * 5, 2)
+    assert counted(lambda: None) == (0, 0)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
         (lambda: learning_band([1.0], 2), "at least two scores, got 1"),
-        (lambda: speed_band([]), "at least one ratio"),
+        (lambda: cost_band([], 1.0), "at least one cost"),
         (lambda: verdicts({"new": 1.0}, {}), "Nothing is recorded of new"),
     ],
 )
@@ -66,15 +92,17 @@ def test_a_plant_does_the_work_two_times_and_goes_away() -> None:
 
 
 def test_a_fault_is_noticed_by_its_own_numbers_and_where_nothing_else_is_red(monkeypatch: pytest.MonkeyPatch) -> None:
-    measured: dict[str, list[dict[str, float]]] = {}
+    measured: list[dict[str, float]] = []
 
     def prove_with(*rounds: dict[str, float]) -> bool:
-        measured["speed"] = list(rounds)
+        measured[:] = rounds
         return gate.prove(["planted"])
 
-    monkeypatch.setattr(gate, "measure", lambda part: measured[part].pop(0))
-    monkeypatch.setattr(gate, "read_records", lambda: {"speed": {"one": [1.0], "other": [1.0]}})
-    monkeypatch.setitem(PLANTS, "planted", Plant(contextlib.nullcontext, "speed", ("one",)))
+    band = Band(0.0, 1.5)
+    part = Part(lambda: measured.pop(0), lambda before: before, lambda recorded: {"one": band, "other": band}, "ratio")
+    monkeypatch.setitem(PARTS, "part", part)
+    monkeypatch.setattr(gate, "read_records", lambda: {"part": None})
+    monkeypatch.setitem(PLANTS, "planted", Plant(contextlib.nullcontext, "part", ("one",)))
     good, red, other_red = {"one": 1.0, "other": 1.0}, {"one": 2.0, "other": 1.0}, {"one": 1.0, "other": 2.0}
     assert prove_with(good, red)
     assert not prove_with(good, good)
@@ -84,7 +112,8 @@ def test_a_fault_is_noticed_by_its_own_numbers_and_where_nothing_else_is_red(mon
 
 def test_every_fault_has_numbers_that_are_recorded() -> None:
     records = read_records()
-    assert all(set(plant.numbers) <= set(records[plant.part]) and plant.numbers for plant in PLANTS.values())
+    for plant in PLANTS.values():
+        assert plant.numbers and set(plant.numbers) <= set(PARTS[plant.part].bands(records[plant.part]))
 
 
 def test_without_a_record_the_gate_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,9 +124,12 @@ def test_without_a_record_the_gate_says_what_to_do(tmp_path: Path, monkeypatch: 
 
 def test_the_records_cover_what_is_measured_with_seeds_of_their_own() -> None:
     records = read_records()
-    assert set(records["learning"]) == set(RUNS)
-    for scores in records["learning"].values():
-        assert len(scores) >= 20 and not {int(seed) for seed in scores} & set(SEEDS)
-    assert {f"rollout / steps, {task}" for task in ROLLOUT_TASKS} < set(records["speed"])
-    assert all(len(ratios) >= 10 for ratios in records["speed"].values())
-    assert all(band.low < band.high for part in records if part != "of" for band in bands(records, part, len(SEEDS)).values())
+    assert set(records["learning"]) == set(RUNS) and set(records["work"]) == set(COUNTS)
+    for name, scores in (records["learning"] | records["work"]).items():
+        assert len(scores) >= 20, name
+        assert not {int(seed) for seed in scores} & {*SEEDS, SEED}, name
+    for ratios in records["speed"].values():
+        assert {f"rollout / steps, {task}" for task in ROLLOUT_TASKS} < set(ratios)
+        assert all(len(runs) >= 10 for runs in ratios.values())
+    for name, part in PARTS.items():
+        assert all(band.low < band.high for band in part.bands(records[name]).values())

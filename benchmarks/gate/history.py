@@ -5,6 +5,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import pandas as pd
 
+from benchmarks.gate.parts import PARTS
 from benchmarks.gate.records import HISTORY
 
 FIGURE = Path(__file__).parents[2] / "docs" / "images" / "gate_history.svg"
@@ -31,7 +32,7 @@ def draw(history: Path = HISTORY, figure_path: Path = FIGURE) -> Path:
         axis.plot(places, of["value"], "o-", markersize=4)
         axis.set_xticks(places, [commit[:7] for commit in of["commit"].fillna("")], rotation=60, fontsize=7)
         axis.set_title(name, fontsize=9)
-        axis.set_ylabel("mean return" if of["part"].iloc[0] == "learning" else "ratio of times", fontsize=8)
+        axis.set_ylabel(PARTS[of["part"].iloc[0]].unit, fontsize=8)
     for axis in axes.flat[len(names) :]:
         axis.set_visible(False)
     figure.savefig(figure_path)

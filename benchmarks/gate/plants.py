@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 from unittest import mock
 
 from benchmarks.gate.learning import RUNS
+from benchmarks.gate.work import COUNTS
 from sb3_gae import TRPOGAE, GAERolloutBuffer
 from sb3_gae.rollout.collection import ActionSampler
 from sb3_gae.update import trust_region
@@ -70,7 +71,8 @@ class Plant(NamedTuple):
 
 #: by name
 PLANTS = {
-    "doubled-cg": Plant(doubled_conjugate_gradient, "speed", ("value fit / passes",)),
+    "doubled-cg": Plant(doubled_conjugate_gradient, "work", COUNTS),
+    "doubled-cg-timed": Plant(doubled_conjugate_gradient, "speed", ("update / sb3-contrib's", "value fit / passes")),
     "doubled-actions": Plant(doubled_actions, "speed", ("actions / policy's own",)),
     "wrong-sign": Plant(wrong_sign, "learning", tuple(RUNS)),
     "value-first": Plant(value_first, "learning", ("HalfCheetah-v5, close fit",)),

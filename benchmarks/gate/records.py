@@ -5,10 +5,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from benchmarks.gate.bands import Band, learning_band, speed_band
-
 RESULTS = Path(__file__).parents[1] / "results"
-#: what the bands are derived from: scores of each learning run by seed, ratios of each speed by run
+#: what the bands are derived from
 RECORDS = RESULTS / "gate.json"
 #: a row for each number of each recorded commit
 HISTORY = RESULTS / "gate_history.csv"
@@ -17,7 +15,7 @@ HISTORY_COLUMNS = ("date", "commit", "part", "name", "value", "low", "high")
 
 def read_records() -> dict[str, Any]:
     """
-    :return: ``{"learning": {name: {seed: score}}, "speed": {name: [ratio]}}``
+    :return: what :mod:`benchmarks.gate.parts` has recorded of each part, by its name, and under ``"of"`` of which code that is
     :raises SystemExit: if nothing was ever recorded
     """
     if not RECORDS.exists():
@@ -31,18 +29,6 @@ def write_records(records: dict[str, Any]) -> None:
     """
     RECORDS.parent.mkdir(exist_ok=True)
     RECORDS.write_text(json.dumps(records, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
-
-
-def bands(records: dict[str, Any], part: str, n_seeds: int) -> dict[str, Band]:
-    """
-    :param records: as :func:`read_records` returns them
-    :param part: ``"speed"`` or ``"learning"``
-    :param n_seeds: of the means that are judged
-    :return: by name
-    """
-    if part == "learning":
-        return {name: learning_band(list(scores.values()), n_seeds) for name, scores in records["learning"].items()}
-    return {name: speed_band(ratios) for name, ratios in records["speed"].items()}
 
 
 def add_to_history(rows: list[dict[str, Any]]) -> None:

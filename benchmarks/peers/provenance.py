@@ -13,7 +13,7 @@ _PEERS = ("sb3-contrib", "tianshou", "envpool")
 def origin() -> dict[str, str | int]:
     """:return: versions of packages, the commit, the processor, its cores and how many of them the run may use"""
     peers = {name.replace("-", "_"): _version_of(name) for name in _PEERS}
-    machine: dict[str, str | int] = {"processor": _processor(), "cores": os.cpu_count() or 0, "cores_of_run": _cores_of_run()}
+    machine: dict[str, str | int] = {"processor": processor(), "cores": os.cpu_count() or 0, "cores_of_run": _cores_of_run()}
     return {**provenance(), **peers, **machine}
 
 
@@ -24,7 +24,8 @@ def _version_of(package: str) -> str:
         return ""
 
 
-def _processor() -> str:
+def processor() -> str:
+    """:return: what the system calls it"""
     info = Path("/proc/cpuinfo")
     names = [line for line in info.read_text().splitlines() if line.startswith("model name")] if info.exists() else []
     return names[0].partition(":")[2].strip() if names else platform.processor()

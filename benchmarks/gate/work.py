@@ -1,0 +1,65 @@
+"""The work of an update as counts, which are the same however fast or busy the machine is."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch as th
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import FlopCounterMode
+
+from benchmarks.gate.speed import BATCH, forward_and_backward
+from benchmarks.update_speed import ours
+from sb3_gae.rollout.evaluation import training_batch
+
+#: of the rollout that the gate judges; what it is judged by is recorded with others
+SEED = 0
+#: of each of these: additions and multiplications of its matrix products, over those of a forward and a backward pass of
+#: both networks, and the operators that it calls
+COUNTS = (
+    "arithmetic of policy step / passes",
+    "operators of policy step",
+    "arithmetic of value fit / passes",
+    "operators of value fit",
+)
+
+
+class OperatorCounter(TorchDispatchMode):
+    """
+    Counts the operators of PyTorch that are called within the ``with`` statement.
+
+    On small batches an update takes as long as its operators need to be called.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        self.calls += 1
+        return func(*args, **(kwargs or {}))
+
+
+def work_counts(seed: int = SEED) -> dict[str, float]:
+    """
+    :param seed: of rollout and networks
+    :return: by name, one of :data:`COUNTS`
+    """
+    th.set_num_threads(1)
+    model = ours(BATCH, seed=seed)
+    batch = training_batch(model.rollout_buffer, model.action_space)
+    parameters = model._parameter_groups(batch)
+    passes, _ = counted(lambda: forward_and_backward(model))
+    policy_step = counted(lambda: model._step_policy(batch, parameters))
+    value_fit = counted(lambda: model._fit_value(batch, parameters))
+    counts = (policy_step[0] / passes, policy_step[1], value_fit[0] / passes, value_fit[1])
+    return dict(zip(COUNTS, counts, strict=True))
+
+
+def counted(action: Callable[[], object]) -> tuple[int, int]:
+    """
+    :param action: to be done once
+    :return: additions and multiplications of its matrix products, and the number of operators that it calls
+    """
+    with OperatorCounter() as operators, FlopCounterMode(display=False) as arithmetic:
+        action()
+    return arithmetic.get_total_flops(), operators.calls
