@@ -117,14 +117,15 @@ def forward_and_backward(model: TRPOGAE) -> None:
 def least_seconds(actions: dict[str, tuple[Callable[[], object], Callable[[], None] | None]]) -> dict[str, float]:
     """
     :param actions: what to time, and what puts things back before it
-    :return: the least time of each in rounds of all of them, in seconds; noise only ever adds to it
+    :return: the least time of each in rounds of all of them, in seconds; noise only ever adds to it. They are the
+        processor's, of all threads, since a busy machine would add its waiting to every round of what takes long
     """
     least = dict.fromkeys(actions, np.inf)
     for _ in range(ROUNDS):
         for name, (action, before) in actions.items():
             if before is not None:
                 before()
-            start = time.perf_counter()
+            start = time.process_time()
             action()
-            least[name] = min(least[name], time.perf_counter() - start)
+            least[name] = min(least[name], time.process_time() - start)
     return least
