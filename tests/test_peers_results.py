@@ -12,10 +12,10 @@ from matplotlib import rc_context
 from peers_data import A_PROCESSOR, ENDS, SEEDS, TASKS, a_run, results
 from rliable import metrics
 
-from benchmarks.peers import aggregates, report, tables, targets
+from benchmarks.peers import aggregates, over_tasks, report, tables, targets
 from benchmarks.peers.aggregates import improvement, interquartile_means, normalized, probability_of_improvement, ratio
 from benchmarks.peers.algorithms import A2C, ALGORITHMS, OURS, PPO, TRPO
-from benchmarks.peers.comparison import final_scores, mujoco_runs, on_one_processor, scores_after, times_to_reach
+from benchmarks.peers.comparison import final_scores, is_learned, mujoco_runs, on_one_processor, scores_after, times_to_reach
 from benchmarks.peers.curves import Run, against_seconds, against_steps, first_reach, runs_of, scores_of
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.figures import draw_all
@@ -90,6 +90,7 @@ def test_time_to_reach_is_part_of_the_peers_training() -> None:
     # Ours climbs to 3 000 within 50 s, and is evaluated every 2.5 s; TRPO is there after half of its 400 s
     assert reach.seconds == pytest.approx(35)
     assert reach.peer_seconds == pytest.approx(200)
+    assert (reach.steps, reach.peer_steps) == pytest.approx((350_000, 500_000))
     assert reach.part == pytest.approx(35 / 400)
 
 
@@ -130,9 +131,20 @@ def test_scores_are_in_units_of_the_peers() -> None:
     means = interquartile_means(scores)
     assert means[TRPO].point == pytest.approx(1, abs=1e-3)
     assert means[OURS].point == pytest.approx(1.5, abs=1e-3)
-    assert ratio(scores[OURS], scores[PPO]).point == pytest.approx(2, abs=1e-3)
+    assert ratio(scores[OURS], scores[PPO], scores[TRPO]).point == pytest.approx(2, abs=1e-3)
     # After a twentieth of TRPO's time ours has climbed a fifth of the way and more
     assert interquartile_means(scores_after(runs, 0.05))[OURS].point == pytest.approx(0.4 * 1.5, rel=1e-2)
+
+
+def test_chance_in_the_units_widens_the_interval_of_a_ratio_but_to_the_units_themselves_once() -> None:
+    rng = np.random.default_rng(0)
+    ours, peer = (mean + rng.normal(size=(8, 4)) for mean in (15.0, 10.0))
+    exact, uncertain = np.ones((8, 4)), np.array([[0.5], [1.5]] * 4) * np.array([1.0, 0.5, 2.0, 1.0])
+    narrow, wide = ratio(ours, peer, exact), ratio(ours, peer, uncertain / uncertain.mean(axis=0))
+    assert narrow.point == pytest.approx(wide.point)
+    assert wide.high - wide.low > narrow.high - narrow.low
+    # In units of its own the peer is 1 in each resample, so the ratio is that of the parts
+    assert ratio(2.0 * peer, peer, peer).point == pytest.approx(2.0)
 
 
 def test_a_unit_must_be_positive() -> None:
@@ -164,12 +176,16 @@ def test_tables_say_what_the_results_say(sections: dict[str, str]) -> None:
         ["PPO, SB3", "3 × 2"],
     ]
     assert rows_of(sections["over tasks"])[1][3] == "1.00 [1.00, 1.00]"
-    assert rows_of(sections["classic"])[0][0::4] == ["CartPole-v1", "no"]
-    assert rows_of(sections["three million"])[0][0::2] == ["Ant-v5", "4 079"]
+    assert rows_of(sections["classic"])[0][0::5] == ["CartPole-v1", "no"]
+    assert rows_of(sections["classic"])[0][4].startswith("0.00 ")
+    assert rows_of(sections["three million"])[0][0::3] == ["Ant-v5", "4 079"]
     assert rows_of(sections["ablation"])[1][0] == "Monte-Carlo targets, not λ-returns"
     assert rows_of(sections["ablation"])[1][-1].startswith("0.50 ")
-    assert rows_of(sections["reach"])[1] == ["Hopper-v5", "2 001", "350 000", "35 s", "200 s", "400 s", "0.09"]
-    assert rows_of(sections["clock"])[0][2] == ""
+    assert rows_of(sections["reach"])[1] == [
+        *["Hopper-v5", "2 001", "350 000", "500 000", "35 s", "200 s", "400 s"],
+        *["0.17", "0.09"],
+    ]
+    assert rows_of(sections["clock"])[0][1:4:2] == ["3 × 2", ""]
     assert "- processor: a processor" in sections["origin"]
     assert "each of the processor, median over runs: SB3's A2C 1.50, at most 1.50; " in sections["origin"]
 
@@ -177,9 +193,9 @@ def test_tables_say_what_the_results_say(sections: dict[str, str]) -> None:
 def test_the_summary_names_the_best_peer_first_and_how_many_runs_there_are(sections: dict[str, str]) -> None:
     assert sections["summary"] == (
         "Over 2 tasks the interquartile mean of TRPOGAE is 1.50 [1.50, 1.50] times that of sb3-contrib's TRPO and "
-        "2.00 [2.00, 2.00] times that of SB3's PPO. Runs on each task: TRPOGAE 3, sb3-contrib's TRPO 3, SB3's PPO 3."
+        "2.00 [2.00, 2.00] times that of SB3's PPO. Runs that count on each task: TRPOGAE 3, sb3-contrib's TRPO 3, SB3's PPO 3."
     )
-    assert tables.summary(TABLE[TABLE["seed"] < 2]).endswith("**Few runs, so little is said of chance.**")
+    assert over_tasks.summary(TABLE[TABLE["seed"] < 2]).endswith("**Few runs, so little is said of chance.**")
 
 
 def test_targets_are_met_or_not(sections: dict[str, str]) -> None:
@@ -213,11 +229,15 @@ def test_what_trpo_does_not_learn_is_no_target() -> None:
     table = TABLE.copy()
     falls = (table["task"] == "Hopper-v5") & (table["algorithm"] == TRPO)
     table.loc[falls, "mean_return"] = 3000.0 - table.loc[falls, "mean_return"]
-    reach = times_to_reach(mujoco_runs(table))["Hopper-v5"]
-    assert not reach.is_learned
-    assert rows_of(tables.reach_table(table))[1] == ["Hopper-v5", "999", "", "", "", "", "TRPO ends no higher than it begins"]
+    runs = mujoco_runs(table)
+    assert not is_learned(runs["Hopper-v5"])
     # Reached at once, and yet not what the target asks for
-    assert "on all 1 that it learns" in rows_of(targets.targets_table(table))[2]
+    assert list(times_to_reach(runs)) == ["HalfCheetah-v5"]
+    over_all, _, reach = rows_of(targets.targets_table(table))[:3]
+    assert "on all 1 that it learns" in reach[1] and reach[2] == "1 of 5"
+    assert "; without Hopper-v5 1.5" in over_all[1]
+    assert "Without Hopper-v5, which sb3-contrib's TRPO does not learn, it is 1.5" in over_tasks.summary(table)
+    assert over_tasks.aggregate_table(table).splitlines()[0].endswith("| the same without Hopper-v5 |")
     falls = table["algorithm"] == TRPO
     table.loc[falls, "mean_return"] = 3000.0 - TABLE.loc[falls, "mean_return"]
     assert rows_of(targets.targets_table(table))[2][1::3] == ["it learns none", "so far **no**"]
@@ -225,8 +245,8 @@ def test_what_trpo_does_not_learn_is_no_target() -> None:
 
 def test_one_or_two_runs_have_no_interval() -> None:
     two = TABLE[TABLE["seed"] < 2]
-    assert rows_of(tables.aggregate_table(two))[0][2] == "1.50"
-    assert rows_of(tables.aggregate_table(two))[1][3:] == ["1.00", "1.50"]
+    assert rows_of(over_tasks.aggregate_table(two))[0][2] == "1.50"
+    assert rows_of(over_tasks.aggregate_table(two))[1][3:] == ["1.00", "1.50"]
     assert rows_of(tables.scores_table(two))[1][1] == "3 000 (2 runs)"
 
 

@@ -75,13 +75,22 @@ def probability_of_improvement(first: np.ndarray, second: np.ndarray) -> float:
     return float((0.5 + 0.5 * np.sign(first[:, None] - second[None])).mean())
 
 
-def ratio(first: np.ndarray, second: np.ndarray) -> Interval:
+def ratio(first: np.ndarray, second: np.ndarray, reference: np.ndarray) -> Interval:
     """
     :param first: scores of one algorithm, shape (runs, tasks)
     :param second: of another
+    :param reference: of the algorithm that counts as 1, which may be the second. Its runs are drawn anew with the others,
+        since chance is in the units, too
     :return: how many times as large the interquartile mean of the first is
     """
-    return _interval((first, second), lambda x, y: metrics.aggregate_iqm(x) / metrics.aggregate_iqm(y))
+    if second is reference:
+        return _interval((first, second), lambda x, y: _ratio_in_units(x, y, y))
+    return _interval((first, second, reference), _ratio_in_units)
+
+
+def _ratio_in_units(first: np.ndarray, second: np.ndarray, reference: np.ndarray) -> float:
+    units = interquartile_mean(reference)
+    return float(interquartile_mean((first / units).ravel()) / interquartile_mean((second / units).ravel()))
 
 
 def _interval(scores: tuple[np.ndarray, ...], function: Callable[..., float]) -> Interval:

@@ -129,55 +129,79 @@ def scores_after(runs: Runs, fraction: float) -> Scores:
 
 class Reach(NamedTuple):
     """
-    How soon ours is where sb3-contrib's TRPO ends. Infinite where the median run never gets there. What has to do with time
-    is of the runs on one processor, the target of all.
+    How soon ours is where sb3-contrib's TRPO ends, and how soon TRPO is there for the first time. Medians over runs, infinite
+    where half of them never are. What has to do with seconds is of the runs on one processor, all else of all.
 
     :param target: interquartile mean of TRPO's scores
-    :param steps: median of ours
-    :param seconds: median of ours
-    :param peer_seconds: median of TRPO, to get there for the first time
-    :param peer_training: median of TRPO, for the whole training
-    :param is_learned: whether TRPO ends with more than it began with, so that to be there says something
+    :param steps: of ours
+    :param peer_steps: of TRPO, to get there for the first time
+    :param seconds: of ours
+    :param peer_seconds: of TRPO, to get there for the first time
+    :param peer_training: of TRPO, for the whole training
     """
 
     target: float
     steps: float
+    peer_steps: float
     seconds: float
     peer_seconds: float
     peer_training: float
-    is_learned: bool
 
     @property
     def part(self) -> float:
-        """Of TRPO's training."""
+        """Seconds of ours, of those of TRPO's training."""
         return self.seconds / self.peer_training
+
+
+def is_learned(own: dict[str, list[Run]]) -> bool:
+    """
+    :param own: runs of one task by algorithm
+    :return: whether sb3-contrib's TRPO ends with more than it begins with, so that what it ends with says something
+    """
+    begins = np.array([run.returns[0] for run in own[TRPO]])
+    return float(interquartile_mean(scores_of(own[TRPO]))) > float(interquartile_mean(begins))
+
+
+def learned(runs: Runs) -> Runs:
+    """
+    :param runs: of all tasks
+    :return: of those that sb3-contrib's TRPO learns
+    """
+    return {task: own for task, own in runs.items() if is_learned(own)}
+
+
+def unlearned(runs: Runs) -> list[str]:
+    """
+    :param runs: of all tasks
+    :return: the tasks that sb3-contrib's TRPO does not learn
+    """
+    return [task for task, own in runs.items() if not is_learned(own)]
 
 
 def times_to_reach(runs: Runs) -> dict[str, Reach]:
     """
     :param runs: of all tasks
-    :return: times until the first evaluation at or above the target, of each task that :func:`on_one_processor` has
+    :return: times until the first evaluation at or above the target, of each task that TRPO learns and
+        :func:`on_one_processor` has
     """
-    return {task: _time_to_reach(own, runs[task][TRPO]) for task, own in on_one_processor(runs).items()}
+    return {task: _time_to_reach(own, runs[task]) for task, own in on_one_processor(learned(runs)).items()}
 
 
-def _time_to_reach(timed: dict[str, list[Run]], of_peer: list[Run]) -> Reach:
-    target = float(interquartile_mean(scores_of(of_peer)))
-    ours = np.array([first_reach(run, target) for run in timed[OURS]])
-    peer = np.array([first_reach(run, target) for run in timed[TRPO]])
-    steps, seconds = (float(_median(ours[:, column])) for column in (0, 1))
-    is_learned = target > float(interquartile_mean(np.array([run.returns[0] for run in of_peer])))
-    return Reach(target, steps, seconds, float(_median(peer[:, 1])), training_seconds(timed[TRPO]), is_learned)
+def _time_to_reach(timed: dict[str, list[Run]], own: dict[str, list[Run]]) -> Reach:
+    target = float(interquartile_mean(scores_of(own[TRPO])))
+
+    def steps(name: str) -> float:
+        return float(np.median([first_reach(run, target)[0] for run in own[name]]))
+
+    def seconds(name: str) -> float:
+        return float(np.median([first_reach(run, target)[1] for run in timed[name]]))
+
+    return Reach(target, steps(OURS), steps(TRPO), seconds(OURS), seconds(TRPO), training_seconds(timed[TRPO]))
 
 
 def fewest_runs(groups: Iterable[list[Run]]) -> int:
     """
     :param groups: of runs that something is said of
-    :return: the smallest number of runs
+    :return: the smallest number of runs; 0 of none
     """
-    return min(len(runs) for runs in groups)
-
-
-def _median(values: np.ndarray) -> float:
-    """Of several, infinite ones among them: no mean of one that is finite and one that is not."""
-    return float(np.sort(values)[len(values) // 2])
+    return min((len(runs) for runs in groups), default=0)

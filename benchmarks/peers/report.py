@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import pandas as pd
 
-from benchmarks.peers import tables, targets, tuning_tables
+from benchmarks.peers import over_tasks, tables, targets, tuning_tables
 from benchmarks.peers.errors import PeersError
 from benchmarks.peers.former import marked, notes_on_former
 from benchmarks.peers.page import filled
@@ -15,11 +15,11 @@ from benchmarks.peers.shipped import shipped_table
 from benchmarks.peers.table import read_results
 
 _TABLES: dict[str, Callable[[pd.DataFrame], str]] = {
-    "summary": tables.summary,
+    "summary": over_tasks.summary,
     "targets": targets.targets_table,
     "scores": tables.scores_table,
-    "over tasks": tables.aggregate_table,
-    "clock": tables.clock_table,
+    "over tasks": over_tasks.aggregate_table,
+    "clock": over_tasks.clock_table,
     "reach": tables.reach_table,
     "classic": tables.classic_table,
     "three million": tables.long_table,

@@ -1,38 +1,19 @@
-"""Markdown of the pages of results."""
+"""Tables of the pages of results, task by task."""
 
 import math
-from collections.abc import Callable, Mapping
 
 import numpy as np
 import pandas as pd
 
-from benchmarks.peers.aggregates import Interval, improvement, interquartile_means, normalized, ratio
+from benchmarks.peers.aggregates import improvement, interquartile_means, normalized
 from benchmarks.peers.algorithms import ALGORITHMS, OURS, TRPO
-from benchmarks.peers.comparison import (
-    common_algorithms,
-    fewest_runs,
-    final_scores,
-    mujoco_runs,
-    on_one_processor,
-    score,
-    scores_after,
-    times_to_reach,
-    verdict,
-)
+from benchmarks.peers.comparison import fewest_runs, mujoco_runs, score, times_to_reach, verdict
 from benchmarks.peers.curves import Run, all_runs, runs_of, scores_of
 from benchmarks.peers.page import markdown_table
-from benchmarks.peers.plan import (
-    ABLATION_TASKS,
-    FEW_SEEDS,
-)
+from benchmarks.peers.plan import ABLATION_TASKS
 from benchmarks.peers.protocol import CLASSIC_TASKS, LONG_STEPS, MUJOCO_STEPS, PUBLISHED_PPO
-from benchmarks.peers.texts import decimal_text, is_any_former, number, score_text, seconds_text, short_title, with_note
-from benchmarks.peers.variants import (
-    VARIANTS,
-)
-
-#: parts of sb3-contrib TRPO's training time at which scores are compared
-FRACTIONS = {"a fifth": 0.2, "half": 0.5, "all": 1.0}
+from benchmarks.peers.texts import decimal_text, number, score_text, seconds_text, short_title, with_note
+from benchmarks.peers.variants import VARIANTS
 
 
 def scores_table(table: pd.DataFrame) -> str:
@@ -46,68 +27,6 @@ def scores_table(table: pd.DataFrame) -> str:
     return with_note(markdown_table(["task", *(ALGORITHMS[name].title for name in names)], rows))
 
 
-def aggregate_table(table: pd.DataFrame) -> str:
-    """
-    :param table: of results
-    :return: interquartile mean over tasks, and how probably ours is better
-    """
-    runs = mujoco_runs(table)
-    scores = final_scores(runs) if runs else {}
-    rows = [
-        [
-            ALGORITHMS[name].title,
-            f"{len(scores[name])} × {len(runs)}",
-            decimal_text(mean, len(scores[name])),
-            "" if name == OURS else _against_ours(improvement, scores, name),
-            "" if name == OURS else _against_ours(ratio, scores, name),
-        ]
-        for name, mean in interquartile_means(scores).items()
-    ]
-    return markdown_table(["", "runs × tasks", "IQM", "probability that ours is better", "IQM of ours / its own"], rows)
-
-
-def summary(table: pd.DataFrame) -> str:
-    """
-    :param table: of results
-    :return: in a sentence or two, how far ours is ahead over the MuJoCo tasks, and of how many runs that is said
-    """
-    runs = mujoco_runs(table)
-    if not runs:
-        return ""
-    scores = final_scores(runs)
-    means = interquartile_means(scores)
-    others = sorted((name for name in means if name != OURS), key=lambda name: -means[name].point)
-    factors = " and ".join(f"{_against_ours(ratio, scores, name)} times that of {short_title(name)}" for name in others)
-    counts = ", ".join(f"{short_title(name)} {len(scores[name])}" for name in (OURS, *others))
-    fewest = fewest_runs(own[name] for own in runs.values() for name in scores)
-    caution = "" if fewest >= FEW_SEEDS else " **Few runs, so little is said of chance.**"
-    tasks = f"Over {len(runs)} task{'s' * (len(runs) > 1)} the interquartile mean of {short_title(OURS)} is {factors}."
-    former = [task for task, own in runs.items() if is_any_former(own[OURS])]
-    old = f" Ours on {', '.join(former)} are of settings that are no longer shipped." if former else ""
-    return f"{tasks} Runs on each task: {counts}.{caution}{old}"
-
-
-def clock_table(table: pd.DataFrame) -> str:
-    """
-    :param table: of results
-    :return: the same at equal seconds of training
-    """
-    runs = mujoco_runs(table)
-    if not runs:
-        return ""
-    found = {title: scores_after(runs, fraction) for title, fraction in FRACTIONS.items()}
-    means = {title: interquartile_means(scores) for title, scores in found.items()}
-    rows = []
-    for name in common_algorithms(on_one_processor(runs)):
-        cells = []
-        for title, scores in found.items():
-            cells.append(decimal_text(means[title][name], len(scores[name])))
-            cells.append("" if name == OURS else _against_ours(improvement, scores, name))
-        rows.append([ALGORITHMS[name].title, *cells])
-    heads = [head for title in FRACTIONS for head in (f"IQM after {title}", "ours is better")]
-    return markdown_table(["", *heads], rows)
-
-
 def reach_table(table: pd.DataFrame) -> str:
     """
     :param table: of results
@@ -115,15 +34,16 @@ def reach_table(table: pd.DataFrame) -> str:
     """
     rows = []
     for task, reach in times_to_reach(mujoco_runs(table)).items():
-        if not reach.is_learned:
-            rows.append([task, number(reach.target), *[""] * 4, "TRPO ends no higher than it begins"])
-            continue
-        steps = number(round(reach.steps, -3)) if math.isfinite(reach.steps) else "–"
+        steps = [number(round(value, -3)) if math.isfinite(value) else "never" for value in (reach.steps, reach.peer_steps)]
         times = [seconds_text(value) for value in (reach.seconds, reach.peer_seconds, reach.peer_training)]
-        part = f"{reach.part:.2f}" if math.isfinite(reach.part) else "–"
-        rows.append([task, number(reach.target), steps, *times, part])
-    heads = ["task", "TRPO's final return", "steps of ours", "ours", "TRPO, first time", "TRPO, whole training"]
-    return markdown_table([*heads, "ours / whole training"], rows)
+        parts = [_part(reach.seconds, seconds) for seconds in (reach.peer_seconds, reach.peer_training)]
+        rows.append([task, number(reach.target), *steps, *times, *parts])
+    heads = ["task", "TRPO's final return", "steps of ours", "steps of TRPO", "ours", "TRPO", "TRPO, whole training"]
+    return markdown_table([*heads, "ours / TRPO", "ours / whole training"], rows)
+
+
+def _part(seconds: float, of: float) -> str:
+    return f"{seconds / of:.2f}" if math.isfinite(seconds) and math.isfinite(of) else "–"
 
 
 def classic_table(table: pd.DataFrame) -> str:
@@ -135,9 +55,12 @@ def classic_table(table: pd.DataFrame) -> str:
     for task, steps in CLASSIC_TASKS.items():
         own = all_runs(table, task, steps)
         if OURS in own and TRPO in own:
-            rows.append([task, number(steps), score_text(own[OURS]), score_text(own[TRPO]), verdict(own)])
-    heads = ["task", "steps", ALGORITHMS[OURS].title, ALGORITHMS[TRPO].title, "at least as good"]
-    return with_note(markdown_table(heads, rows))
+            ours, other = own[OURS], own[TRPO]
+            better = improvement(*(scores_of(runs)[:, None] for runs in (ours, other)))
+            probability = decimal_text(better, fewest_runs([ours, other]))
+            rows.append([task, number(steps), score_text(ours), score_text(other), probability, verdict(own)])
+    heads = ["task", "steps", ALGORITHMS[OURS].title, ALGORITHMS[TRPO].title, "probability that ours is better"]
+    return with_note(markdown_table([*heads, "at least as good"], rows))
 
 
 def long_table(table: pd.DataFrame) -> str:
@@ -149,8 +72,10 @@ def long_table(table: pd.DataFrame) -> str:
     for task, published in PUBLISHED_PPO.items():
         if runs := runs_of(table, task, OURS, LONG_STEPS):
             above = "yes" if score(runs).point > published else "no"
-            rows.append([task, score_text(runs), number(published), above])
-    return with_note(markdown_table(["task", ALGORITHMS[OURS].title, "PPO, as tianshou has published it", "above"], rows))
+            largest = number(float(np.mean([run.returns.max() for run in runs])))
+            rows.append([task, score_text(runs), largest, number(published), above])
+    heads = ["task", ALGORITHMS[OURS].title, "its largest evaluations", "PPO, as tianshou has published it", "above"]
+    return with_note(markdown_table(heads, rows))
 
 
 def ablation_table(table: pd.DataFrame) -> str:
@@ -203,7 +128,3 @@ def _disturbance(table: pd.DataFrame) -> str:
     ratios = (ends["wall_seconds"] / ends["cpu_seconds"]).groupby("algorithm")
     of_each = [f"{short_title(name)} {own.median():.2f}, at most {own.max():.2f}" for name, own in ratios]
     return f"seconds of the wall for each of the processor, median over runs: {'; '.join(of_each)}"
-
-
-def _against_ours(measure: Callable[[np.ndarray, np.ndarray], Interval], scores: Mapping[str, np.ndarray], name: str) -> str:
-    return decimal_text(measure(scores[OURS], scores[name]), min(len(scores[OURS]), len(scores[name])))

@@ -5,16 +5,18 @@ from collections.abc import Collection, Iterable
 
 import pandas as pd
 
-from benchmarks.peers.aggregates import interquartile_means, ratio
+from benchmarks.peers.aggregates import Interval, Scores, interquartile_means, ratio
 from benchmarks.peers.algorithms import ALGORITHMS, OURS, TRPO
 from benchmarks.peers.comparison import (
     Runs,
     fewest_runs,
     final_scores,
+    learned,
     mujoco_runs,
     on_one_processor,
     score,
     times_to_reach,
+    unlearned,
     verdict,
 )
 from benchmarks.peers.curves import Run, all_runs, runs_of
@@ -48,27 +50,45 @@ def targets_table(table: pd.DataFrame) -> str:
 
 def _mujoco_targets(runs: Runs) -> Iterable[list[str]]:
     scores = final_scores(runs)
-    means = {name: mean.point for name, mean in interquartile_means(scores).items() if name != OURS}
-    best = max(means, key=lambda name: means[name])
-    factor = ratio(scores[OURS], scores[best])
+    best, factor = _best_peer(scores)
     missing = [ALGORITHMS[name].title for name in ALGORITHMS if name not in scores]
     without = f"; without {' and '.join(missing)}" if missing else ""
     of_all = _Behind([own[name] for own in runs.values() for name in scores], len(runs), MUJOCO_TASKS)
     yield [
         "IQM over tasks at least 1.3 times the best peer's",
-        f"{decimal_text(factor, of_all.fewest)} ({ALGORITHMS[best].title}{without})",
+        f"{decimal_text(factor, of_all.fewest)} ({ALGORITHMS[best].title}{without}){_on_learned_tasks(runs)}",
         *of_all.met(factor.point >= 1.3, FEW_SEEDS, is_complete=not missing),
     ]
     under = [task for task, own in runs.items() if verdict(own) == "no"]
     of_both = _Behind([own[name] for own in runs.values() for name in (OURS, TRPO)], len(runs), MUJOCO_TASKS)
     yield ["no task under sb3-contrib's TRPO by more than the bands", ", ".join(under) or "none is", *of_both.met(not under)]
-    if not (timed := on_one_processor(runs)):
+    if not on_one_processor(runs):
         return
-    parts = {task: reach.part for task, reach in times_to_reach(runs).items() if reach.is_learned}
+    timed = on_one_processor(learned(runs))
+    parts = {task: reach.part for task, reach in times_to_reach(runs).items()}
     slow = [f"{task} ({part:.2f})" if math.isfinite(part) else f"{task} (never)" for task, part in parts.items() if part > 0.2]
     measured = "not on " + ", ".join(slow) if slow else f"on all {len(parts)} that it learns" if parts else "it learns none"
-    of_timed = _Behind([own[name] for own in timed.values() for name in (OURS, TRPO)], len(timed), MUJOCO_TASKS)
+    planned = [task for task in MUJOCO_TASKS if task not in unlearned(runs)]
+    of_timed = _Behind([own[name] for own in timed.values() for name in (OURS, TRPO)], len(timed), planned)
     yield ["its final return in a fifth of its time", measured, *of_timed.met(not slow and bool(parts))]
+
+
+def _best_peer(scores: Scores) -> tuple[str, Interval]:
+    """Whose interquartile mean is the largest, and how many times as large ours is."""
+    means = {name: mean.point for name, mean in interquartile_means(scores).items() if name != OURS}
+    best = max(means, key=lambda name: means[name])
+    return best, ratio(scores[OURS], scores[best], scores[TRPO])
+
+
+def _on_learned_tasks(runs: Runs) -> str:
+    """The same without tasks whose unit is less than what an untrained agent gets."""
+    if not (without := unlearned(runs)) or len(without) == len(runs):
+        return ""
+    of_learned = learned(runs)
+    scores = final_scores(of_learned)
+    best, factor = _best_peer(scores)
+    fewest = fewest_runs(own[name] for own in of_learned.values() for name in scores)
+    return f"; without {', '.join(without)} {decimal_text(factor, fewest)} ({ALGORITHMS[best].title})"
 
 
 class _Behind:
