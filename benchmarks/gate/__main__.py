@@ -3,7 +3,7 @@ Turns red when speed or learning have got worse than what is recorded of unchang
 
     python -m benchmarks.gate                     # some minutes; exit status 1 if a number is outside its band
     python -m benchmarks.gate --keep              # also adds the numbers to the history
-    python -m benchmarks.gate record              # records anew what the bands are made from (half an hour)
+    python -m benchmarks.gate record              # records anew what the bands are made from (ten minutes)
     python -m benchmarks.gate prove               # plants one fault after the other; fails unless its numbers turn red
     python -m benchmarks.gate repeat --times 20   # how often unchanged code is red
     python -m benchmarks.gate draw                # the history as a figure

@@ -53,7 +53,7 @@ def summary(table: pd.DataFrame) -> str:
     scores = final_scores(runs)
     # Those of whom most is known first
     others = sorted((name for name in scores if name != OURS), key=lambda name: -len(scores[name]))
-    factors = " and ".join(f"{_times_as_large(scores, name)} times that of {short_title(name)}" for name in others)
+    factors = ", ".join(f"{_times_as_large(scores, name)} times that of {short_title(name)}" for name in others)
     counts = ", ".join(f"{short_title(name)} {len(scores[name])}" for name in (OURS, *others))
     fewest = fewest_runs(own[name] for own in runs.values() for name in scores)
     caution = "" if fewest >= FEW_SEEDS else " **Few runs, so little is said of chance.**"
