@@ -192,8 +192,8 @@ def test_tables_say_what_the_results_say(sections: dict[str, str]) -> None:
 
 def test_the_summary_names_the_best_peer_first_and_how_many_runs_there_are(sections: dict[str, str]) -> None:
     assert sections["summary"] == (
-        "Over 2 tasks the interquartile mean of TRPOGAE is 1.50 [1.50, 1.50] times that of sb3-contrib's TRPO, "
-        "2.00 [2.00, 2.00] times that of SB3's PPO. Runs that count on each task: TRPOGAE 3, sb3-contrib's TRPO 3, SB3's PPO 3."
+        "Over 2 tasks the interquartile mean of TRPOGAE is 1.50 [1.50, 1.50] times that of sb3-contrib's TRPO, 2.00 "
+        "[2.00, 2.00] times that of SB3's PPO. Runs that count on each task: TRPOGAE 3, sb3-contrib's TRPO 3, SB3's PPO 3."
     )
     assert over_tasks.summary(TABLE[TABLE["seed"] < 2]).endswith("**Few runs, so little is said of chance.**")
 
