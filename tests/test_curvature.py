@@ -1,5 +1,6 @@
 """Curvature products, dense and by autograd, against matrices from the definition of the Fisher information."""
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -215,6 +216,106 @@ def test_a_hook_on_a_last_layer_falls_back(attribute: str) -> None:
     assert not is_dense()
     hook.remove()
     assert is_dense()
+
+
+def are_dense(policy: ActorCriticPolicy) -> tuple[bool, bool]:
+    """Whether the policy and its value function are; the latter of its own parameters alone."""
+    batch = training_batch(policy)
+    of_policy = policy_parameters(policy, batch)
+    of_value = value_parameters(policy, batch, of_policy)
+    return has_dense_policy(policy, of_policy), has_dense_value(policy, of_value)
+
+
+class Residual(nn.Sequential):
+    """Layers like SB3's, and a way past them."""
+
+    def forward(self, input: th.Tensor) -> th.Tensor:
+        return input.sum(dim=1, keepdim=True) + super().forward(input)
+
+
+class Wrapped(nn.Module):
+    """Nothing to iterate over."""
+
+    def __init__(self, layers: nn.Module):
+        super().__init__()
+        self.layers = layers
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        return self.layers(features)
+
+
+@pytest.mark.parametrize("wrap", [lambda layers: Residual(*layers), Wrapped, nn.DataParallel, nn.Sequential])
+@pytest.mark.parametrize("body", ["policy_net", "value_net"])
+def test_hidden_layers_that_are_not_a_plain_sequence_fall_back(body: str, wrap: Callable[[nn.Module], nn.Module]) -> None:
+    policy = double_policy(ACTION_SPACES["Box"])
+    extractor = policy.mlp_extractor
+    setattr(extractor, body, wrap(getattr(extractor, body)))
+    assert are_dense(policy) == (body != "policy_net", body != "value_net")
+
+
+@pytest.mark.parametrize("attribute", ["action_net", "value_net"])
+def test_last_layers_that_only_look_linear_fall_back(attribute: str) -> None:
+    policy = double_policy(ACTION_SPACES["Box"])
+    # Of the same kind as before, and yet of another class
+    layer = getattr(policy, attribute)
+    layer.__class__ = type("Own", (type(layer),), {})
+    assert are_dense(policy) == (attribute != "action_net", attribute != "value_net")
+
+
+@pytest.mark.parametrize("register", ["register_full_backward_hook", "register_full_backward_pre_hook"])
+@pytest.mark.parametrize("path", ["action_net", "value_net", "mlp_extractor.policy_net.1", "mlp_extractor.value_net.1"])
+def test_hooks_on_gradients_of_modules_fall_back_while_they_are_there(path: str, register: str) -> None:
+    policy = double_policy(ACTION_SPACES["Box"])
+    hook = getattr(policy.get_submodule(path), register)(lambda *_: None)
+    assert are_dense(policy) == (False, False)
+    hook.remove()
+    assert are_dense(policy) == (True, True)
+
+
+@pytest.mark.parametrize(
+    ("name", "dense_actor", "dense_critic"),
+    [
+        ("log_std", False, True),
+        ("action_net.weight", False, True),
+        ("mlp_extractor.policy_net.0.bias", False, True),
+        ("value_net.bias", True, False),
+        ("mlp_extractor.value_net.0.weight", True, False),
+    ],
+)
+def test_hooks_on_gradients_of_parameters_fall_back_where_these_belong_while_they_are_there(
+    name: str, dense_actor: bool, dense_critic: bool
+) -> None:
+    policy = double_policy(ACTION_SPACES["Box"])
+    hook = policy.get_parameter(name).register_hook(lambda gradient: 0.0 * gradient)
+    assert are_dense(policy) == (dense_actor, dense_critic)
+    hook.remove()
+    assert are_dense(policy) == (True, True)
+
+
+def test_a_hook_on_a_shared_layer_counts_for_the_value_step_that_moves_it() -> None:
+    policy = double_policy(ACTION_SPACES["Box"], policy_class=SharedMlpPolicy, net_arch=[5, 4])
+    batch = training_batch(policy)
+    policy.mlp_extractor.policy_net[0].weight.register_hook(lambda gradient: 0.0 * gradient)
+    of_policy = policy_parameters(policy, batch)
+    own = value_parameters(policy, batch, of_policy)
+    shared = shared_parameters(policy, batch, of_policy)
+    assert not has_dense_policy(policy, of_policy)
+    # To the first of these steps the layer is a constant
+    assert has_dense_value(policy, own)
+    assert not has_dense_value(policy, [*own, *shared])
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 2)], ids=str)
+def test_deviations_that_actions_share_fall_back_to_a_true_fisher_matrix(shape: tuple[int, ...]) -> None:
+    policy = double_policy(ACTION_SPACES["Box"])
+    policy.log_std = nn.Parameter(th.full(shape, -0.3, dtype=th.float64))
+    assert are_dense(policy) == (False, True)
+    batch = training_batch(policy, N_SAMPLES)
+    parameters = policy_parameters(policy, batch)
+    assert any(parameter is policy.log_std for parameter in parameters)
+    expected = fisher_matrix(policy, batch.observations, parameters)
+    matrix = dense_matrix(autograd_fisher_product(policy, parameters, batch.observations), len(expected))
+    th.testing.assert_close(matrix, expected, rtol=1e-8, atol=1e-8)
 
 
 def test_frozen_layers_fall_back() -> None:

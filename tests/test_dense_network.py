@@ -17,8 +17,10 @@ ACTIVATIONS: dict[str, nn.Module] = {
     "relu in place": nn.ReLU(inplace=True),
     "leaky relu": nn.LeakyReLU(),
     "steep leaky relu": nn.LeakyReLU(0.4),
+    "flat leaky relu": nn.LeakyReLU(0.0),
     "elu": nn.ELU(),
     "elu with alpha": nn.ELU(alpha=0.3),
+    "flat elu": nn.ELU(alpha=0.0),
 }
 each_activation = pytest.mark.parametrize("activation", ACTIVATIONS.values(), ids=ACTIVATIONS.keys())
 
@@ -39,6 +41,18 @@ def layers_with(activation: nn.Module | None, sizes: list[int], bias: bool = Tru
 
 def inputs_for(n_samples: int, n_inputs: int = 3) -> th.Tensor:
     return th.randn(n_samples, n_inputs, generator=th.Generator().manual_seed(1), dtype=th.float64)
+
+
+def tangents_of(network: DenseNetwork, vector: th.Tensor) -> th.Tensor:
+    """How the outputs move along a direction: what a curvature product gives its metric, block by block."""
+    blocks: list[th.Tensor] = []
+
+    def metric(tangents: th.Tensor, rows: slice) -> th.Tensor:
+        blocks.append(tangents)
+        return tangents
+
+    network.gauss_newton_product(vector, metric)
+    return th.cat(blocks)
 
 
 def check_products(layers: list[nn.Module], inputs: th.Tensor) -> None:
@@ -63,7 +77,7 @@ def check_products(layers: list[nn.Module], inputs: th.Tensor) -> None:
         return th.einsum("bij,bj->bi", metrics[rows], tangents)
 
     exactly = dict(rtol=1e-11, atol=1e-11)
-    th.testing.assert_close(network.jvp(vector), th.einsum("bon,n->bo", dense, vector), **exactly)
+    th.testing.assert_close(tangents_of(network, vector), th.einsum("bon,n->bo", dense, vector), **exactly)
     th.testing.assert_close(network.vjp(cotangents), th.einsum("bon,bo->n", dense, cotangents), **exactly)
     expected = th.einsum("bin,bij,bjm,m->n", dense, metrics, dense, vector)
     th.testing.assert_close(network.gauss_newton_product(vector, metric), expected, **exactly)
@@ -133,7 +147,8 @@ def test_products_belong_to_the_parameters_of_the_last_forward_pass() -> None:
     fresh = DenseNetwork(layers, inputs)
     fresh.forward()
     assert th.equal(network.vjp(cotangents), fresh.vjp(cotangents))
-    assert th.equal(network.jvp(th.ones(network.n_parameters).double()), fresh.jvp(th.ones(fresh.n_parameters).double()))
+    ones = th.ones(network.n_parameters).double()
+    assert th.equal(tangents_of(network, ones), tangents_of(fresh, ones))
 
 
 @each_activation
@@ -163,7 +178,6 @@ def test_nothing_given_is_modified() -> None:
     before = [tensor.detach().clone() for tensor in given]
     network = DenseNetwork(layers, inputs)
     network.forward()
-    network.jvp(given[1])
     network.vjp(given[2])
     network.gauss_newton_product(given[1], lambda tangents, rows: tangents)
     assert all(th.equal(tensor, copy) for tensor, copy in zip(given, before, strict=True))
@@ -173,7 +187,7 @@ def test_single_precision_stays_single() -> None:
     layers = [layer.float() for layer in layers_with(nn.Tanh(), [3, 4, 2])]
     network = DenseNetwork(layers, inputs_for(5).float())
     assert network.forward().dtype == th.float32
-    assert network.jvp(th.ones(26)).dtype == network.vjp(th.ones(5, 2)).dtype == th.float32
+    assert tangents_of(network, th.ones(26)).dtype == network.vjp(th.ones(5, 2)).dtype == th.float32
 
 
 # --- What it refuses ---
@@ -205,6 +219,9 @@ class MyTanh(nn.Tanh):
         [nn.Linear(2, 2), nn.GELU(), nn.Linear(2, 2)],
         [nn.Linear(2, 2), nn.SiLU(), nn.Linear(2, 2)],
         [nn.Linear(2, 2), nn.PReLU(), nn.Linear(2, 2)],
+        # What comes out of these does not tell on which side of zero the input was
+        [nn.Linear(2, 2), nn.LeakyReLU(-0.1), nn.Linear(2, 2)],
+        [nn.Linear(2, 2), nn.ELU(-1.0), nn.Linear(2, 2)],
         [nn.Linear(2, 2), MyTanh(), nn.Linear(2, 2)],
         [nn.Linear(2, 2), nn.Dropout(), nn.Linear(2, 2)],
         [nn.Linear(2, 2), nn.LayerNorm(2), nn.Linear(2, 2)],
@@ -243,10 +260,27 @@ def test_tied_weights_are_refused() -> None:
 
 
 @pytest.mark.parametrize("index", [0, 1, 2])
-@pytest.mark.parametrize("register", ["register_forward_hook", "register_forward_pre_hook"])
+@pytest.mark.parametrize(
+    "register",
+    [
+        "register_forward_hook",
+        "register_forward_pre_hook",
+        "register_full_backward_hook",
+        "register_full_backward_pre_hook",
+    ],
+)
 def test_hooks_are_refused_while_they_are_there(index: int, register: str) -> None:
     layers = layers_with(nn.Tanh(), [3, 4, 2])
     hook = getattr(layers[index], register)(lambda *_: None)
+    assert not DenseNetwork.supports(layers)
+    hook.remove()
+    assert DenseNetwork.supports(layers)
+
+
+@pytest.mark.parametrize("which", ["weight", "bias"])
+def test_hooks_on_gradients_of_parameters_are_refused_while_they_are_there(which: str) -> None:
+    layers = layers_with(nn.Tanh(), [3, 4, 2])
+    hook = getattr(layers[2], which).register_hook(lambda gradient: 0.0 * gradient)
     assert not DenseNetwork.supports(layers)
     hook.remove()
     assert DenseNetwork.supports(layers)

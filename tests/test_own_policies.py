@@ -10,7 +10,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_gae import MlpPolicy
+from sb3_gae import TRPOGAE, MlpPolicy
+from sb3_gae.rollout.collection import ActionSampler
 
 
 class OwnNames(ActorCriticPolicy):
@@ -70,6 +71,131 @@ class Attentive(BaseFeaturesExtractor):
 def test_attention_is_differentiated_twice(share: bool) -> None:
     policy_kwargs = {"net_arch": [], "features_extractor_class": Attentive, "share_features_extractor": share}
     check_training(small_model(vec_env(), policy_kwargs=policy_kwargs))
+
+
+class Residual(nn.Sequential):
+    """Layers like SB3's, and a way past them."""
+
+    def forward(self, input: th.Tensor) -> th.Tensor:
+        return input.sum(dim=1, keepdim=True) + super().forward(input)
+
+
+class Branched(nn.Module):
+    """The layers, without their order."""
+
+    def __init__(self, *layers: nn.Module):
+        super().__init__()
+        self.layers = nn.ModuleDict({str(number): layer for number, layer in enumerate(layers)})
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        for layer in self.layers.values():
+            features = layer(features)
+        return features
+
+
+@pytest.mark.parametrize("body", ["policy_net", "value_net"])
+@pytest.mark.parametrize("kind", [Residual, Branched])
+def test_hidden_layers_may_be_any_module(kind: type[nn.Module], body: str) -> None:
+    model = small_model(vec_env())
+    extractor = model.policy.mlp_extractor
+    setattr(extractor, body, kind(*getattr(extractor, body)))
+    check_training(model)
+    assert_drawn_as_judged(model)
+
+
+def assert_drawn_as_judged(model: TRPOGAE) -> None:
+    """The actions of a rollout are those of the distribution that the update takes them to be of."""
+    observations = th.linspace(-1.0, 1.0, 6).reshape(2, 3)
+    th.manual_seed(0)
+    with th.no_grad():
+        expected = model.policy.get_distribution(observations).sample()
+    th.manual_seed(0)
+    th.testing.assert_close(th.as_tensor(ActionSampler(model.policy)(observations.numpy(), 0)), expected)
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (1, 2)], ids=str)
+def test_actions_may_share_their_deviations(shape: tuple[int, ...]) -> None:
+    model = small_model(vec_env())
+    model.policy.log_std = nn.Parameter(th.zeros(shape))
+    check_training(model)
+    assert_drawn_as_judged(model)
+    assert model.policy.log_std.abs().min() > 0.0
+
+
+@pytest.mark.parametrize("shape", [(), (2,)], ids=str)
+@pytest.mark.parametrize("is_buffer", [True, False], ids=["buffer", "tensor"])
+def test_deviations_may_be_constants(is_buffer: bool, shape: tuple[int, ...]) -> None:
+    model = small_model(vec_env())
+    del model.policy.log_std
+    constant = th.full(shape, -0.5)
+    if is_buffer:
+        model.policy.register_buffer("log_std", constant)
+    else:
+        model.policy.log_std = constant
+    check_training(model)
+    assert_drawn_as_judged(model)
+    assert (model.policy.log_std == -0.5).all()
+
+
+@pytest.mark.parametrize("activation", [nn.LeakyReLU(-0.1), nn.ELU(-1.0)], ids=["leaky relu", "elu"])
+def test_activations_may_fall_where_their_inputs_rise(activation: nn.Module) -> None:
+    check_training(small_model(vec_env(), policy_kwargs={"net_arch": [8], "activation_fn": lambda: activation}))
+
+
+def test_hooks_on_gradients_of_parameters_count_while_they_are_there() -> None:
+    """What SB3's own algorithms leave alone, for its gradient is masked."""
+    model = small_model(vec_env())
+    policy = model.policy
+    parameters = [
+        policy.log_std,
+        policy.action_net.weight,
+        policy.mlp_extractor.policy_net[0].bias,
+        policy.value_net.weight,
+        policy.mlp_extractor.value_net[0].weight,
+    ]
+
+    def only_first(gradient: th.Tensor) -> th.Tensor:
+        mask = th.zeros_like(gradient)
+        mask.view(-1)[0] = 1.0
+        return mask * gradient
+
+    def moved() -> list[list[bool]]:
+        # Weights of the last value layer follow the scale of the targets
+        scale = policy.value_net.scale.clone()
+        before = [parameter.detach().clone() for parameter in parameters]
+        check_training(model, 1)
+        before[3] *= scale / policy.value_net.scale
+        return [(now != then).flatten().tolist() for now, then in zip(parameters, before, strict=True)]
+
+    train_once(model)  # sets that scale
+    hooks = [parameter.register_hook(only_first) for parameter in parameters]
+    for which in moved():
+        assert which[0]
+        assert not any(which[1:])
+    for hook in hooks:
+        hook.remove()
+    assert all(all(which) for which in moved())
+
+
+@pytest.mark.parametrize("register", ["register_full_backward_hook", "register_full_backward_pre_hook"])
+def test_hooks_on_gradients_of_modules_count_while_they_are_there(register: str) -> None:
+    model = small_model(vec_env())
+    policy = model.policy
+
+    def without_gradients(module: nn.Module, *gradients: Any) -> Any:
+        return tuple(None if gradient is None else 0.0 * gradient for gradient in gradients[0])
+
+    # By the one of what goes into the last layer, by the other of what comes out of it
+    before = state_of(policy)
+    hook = getattr(policy.action_net, register)(without_gradients)
+    check_training(model)
+    changed = differing(before, state_of(policy))
+    assert not [name for name in changed if "policy_net" in name]
+    assert "log_std" in changed
+    assert ("action_net.weight" in changed) == (register == "register_full_backward_hook")
+    hook.remove()
+    check_training(model, 1)
+    assert [name for name in differing(before, state_of(policy)) if "policy_net" in name]
 
 
 def test_a_policy_needs_none_of_sb3s_layers() -> None:

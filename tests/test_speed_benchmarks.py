@@ -71,7 +71,6 @@ def test_passes_of_a_network_are_what_torch_counts(network: DenseNetwork) -> Non
     passes = {
         ops.operations(ops.forward(LAYERS, BATCH)): network.forward,
         ops.operations(ops.backward(LAYERS, BATCH)): lambda: network.vjp(outputs),
-        ops.operations(ops.tangents(LAYERS, BATCH)): lambda: network.jvp(vector),
         ops.operations(ops.curvature_product(LAYERS, BATCH)): lambda: network.gauss_newton_product(vector, lambda x, _: x),
         ops.operations(ops.kronecker_factors(LAYERS, BATCH)): lambda: network.kronecker_factors(outputs),
     }

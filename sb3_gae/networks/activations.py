@@ -14,10 +14,12 @@ class _Activation(NamedTuple):
     """
     :param apply: to what a layer puts out, given with the module, in place
     :param times_derivative: multiplies tangents, in place, given with the module and what came out
+    :param is_enough: whether what comes out of this module tells on which side of zero the input was
     """
 
     apply: Callable[[Any, th.Tensor], object]
     times_derivative: Callable[[Any, th.Tensor, th.Tensor], object]
+    is_enough: Callable[[Any], bool] = lambda _: True
 
 
 # The fused kernels of torch's own backward pass read each array once
@@ -37,25 +39,28 @@ _KNOWN: dict[type[nn.Module], _Activation] = {
     nn.LeakyReLU: _Activation(
         lambda module, x: functional.leaky_relu_(x, module.negative_slope),
         lambda module, t, h: _aten.leaky_relu_backward.grad_input(t, h, module.negative_slope, True, grad_input=t),
+        lambda module: module.negative_slope >= 0.0,
     ),
     nn.ELU: _Activation(
         lambda module, x: functional.elu_(x, module.alpha),
         lambda module, t, h: _aten.elu_backward.grad_input(t, module.alpha, 1, 1, True, h, grad_input=t),
+        lambda module: module.alpha >= 0.0,
     ),
 }
 
 
-def is_known(activation: nn.Module) -> bool:
+def has_known_derivative(activation: nn.Module) -> bool:
     """
     :param activation: any module
     :return: whether the others here know it; a subclass may do something else
     """
-    return type(activation) in _KNOWN
+    known = _KNOWN.get(type(activation))
+    return known is not None and known.is_enough(activation)
 
 
 def activate_(activation: nn.Module, outputs: th.Tensor) -> None:
     """
-    :param activation: one that :func:`is_known`
+    :param activation: one that :func:`has_known_derivative`
     :param outputs: of a layer before it, without a graph; overwritten by those after it
     """
     _KNOWN[type(activation)].apply(activation, outputs)
@@ -63,7 +68,7 @@ def activate_(activation: nn.Module, outputs: th.Tensor) -> None:
 
 def times_derivative_(activation: nn.Module, tangents: th.Tensor, activated: th.Tensor) -> None:
     """
-    :param activation: one that :func:`is_known`
+    :param activation: one that :func:`has_known_derivative`
     :param tangents: overwritten by their product with the derivative
     :param activated: what came out of the activation, of the same shape
     """

@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterator, Sequence
 import torch as th
 from torch import nn
 
-from sb3_gae.networks.activations import activate_, is_known, times_derivative_
+from sb3_gae.networks.activations import activate_, has_known_derivative, times_derivative_
 from sb3_gae.networks.joined_layers import joined_columns, joined_parameters, joined_pieces, joined_zeros, separated
-from sb3_gae.networks.layers import pair_up
+from sb3_gae.networks.layers import has_hook, pair_up
 
 # Samples that go through all layers together: few enough to stay in the cache, enough to keep the cores busy
 _BLOCK_ROWS = 8192
@@ -49,15 +49,15 @@ class DenseNetwork:
         pairs = pair_up(layers)
         return (
             bool(pairs)
-            and all(type(linear) is nn.Linear and (act is None or is_known(act)) for linear, act in pairs)
-            and not any(layer._forward_hooks or layer._forward_pre_hooks for layer in layers)
+            and all(type(linear) is nn.Linear and (act is None or has_known_derivative(act)) for linear, act in pairs)
+            and not any(has_hook(each) for each in (*layers, *parameters))
             and all(parameter.requires_grad for parameter in parameters)
             and len({id(parameter) for parameter in parameters}) == len(parameters)
         )
 
     @property
     def parameters(self) -> list[nn.Parameter]:
-        """Weights and biases, in the order of the vectors that :meth:`jvp` takes and :meth:`vjp` returns."""
+        """Weights and biases, in the order of the vectors that the products take and return."""
         return [parameter for linear in self._linears for parameter in linear.parameters()]
 
     @property
@@ -143,16 +143,8 @@ class DenseNetwork:
                 factors[layer] = (before[0] + moments[0], before[1] + moments[1])
         return [factors[layer] for layer in range(len(self.layers))]
 
-    @th.no_grad()
-    def jvp(self, vector: th.Tensor) -> th.Tensor:
-        """
-        :param vector: a direction in parameter space, shape (n,)
-        :return: how the outputs move along it, shape (B, n_out)
-        """
-        tangents = joined_pieces(self._linears, vector)
-        return th.cat([self._jvp_block(index, tangents).t() for index in range(len(self._hidden))])
-
     def _jvp_block(self, index: int, tangents: list[th.Tensor]) -> th.Tensor:
+        """How the outputs of a block move along a direction in parameter space, shape (n_out, B)."""
         tangent = th.empty(0)
         for layer, weights in enumerate(tangents):
             moved = weights @ self._hidden[index][layer]

@@ -16,7 +16,8 @@ from torch import nn
 
 from sb3_gae.batch import in_chunks
 from sb3_gae.networks.dense_network import DenseNetwork
-from sb3_gae.networks.distributions import is_known
+from sb3_gae.networks.distributions import has_known_metric
+from sb3_gae.networks.layers import has_hook
 from sb3_gae.networks.value_head import ValueHead
 
 
@@ -28,7 +29,8 @@ def has_dense_policy(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor])
     """
     return (
         _inherits(policy, "get_distribution", "extract_features", "_get_action_dist_from_latent")
-        and is_known(policy.action_dist)
+        and has_known_metric(policy.action_dist)
+        and _has_own_deviations(policy)
         and _hold_exactly(_policy_layers(policy), policy_log_std(policy), parameters)
     )
 
@@ -88,7 +90,8 @@ def dense_value_network(
 def policy_log_std(policy: ActorCriticPolicy) -> list[th.Tensor]:
     """
     :param policy: any actor-critic policy
-    :return: the one parameter that a Gaussian policy has beside its layers; nothing for others
+    :return: what a Gaussian policy has beside its layers: a parameter or a constant, of any shape that can be broadcast to
+        that of the actions. Of shape (n_actions,) if the policy :func:`has_dense_policy`. Nothing for others
     """
     return [policy.log_std] if type(policy.action_dist) is DiagGaussianDistribution else []
 
@@ -112,19 +115,33 @@ def _value_layers(
 
 
 def _layers(policy: ActorCriticPolicy, body: str, head: nn.Module | None) -> list[nn.Module]:
-    """The layers in order; empty for an extractor that is not SB3's own, or a policy that lacks the head."""
+    """
+    The layers in order; empty for an extractor that is not SB3's own, a body that need not apply its layers one after the
+    other, or a policy that lacks the head.
+    """
     if head is None or type(policy.mlp_extractor) is not MlpExtractor:
         return []
-    return [*getattr(policy.mlp_extractor, body), head]
+    hidden = getattr(policy.mlp_extractor, body)
+    return [*hidden, head] if type(hidden) is nn.Sequential else []
+
+
+def _has_own_deviations(policy: ActorCriticPolicy) -> bool:
+    """Whether each action of a Gaussian policy has a deviation of its own; true of other distributions, which have none."""
+    distribution = policy.action_dist
+    return type(distribution) is not DiagGaussianDistribution or policy.log_std.shape == (distribution.action_dim,)
 
 
 def _hold_exactly(layers: Sequence[nn.Module], others: Sequence[th.Tensor], parameters: Sequence[th.Tensor]) -> bool:
     held = [parameter for layer in layers for parameter in layer.parameters()] + list(others)
-    return DenseNetwork.supports(layers) and {id(tensor) for tensor in held} == {id(tensor) for tensor in parameters}
+    return (
+        DenseNetwork.supports(layers)
+        and not any(map(has_hook, others))
+        and {id(tensor) for tensor in held} == {id(tensor) for tensor in parameters}
+    )
 
 
 def _inherits(policy: ActorCriticPolicy, *methods: str) -> bool:
-    """Whether the policy leaves these methods as SB3 wrote them, and nothing changes what a module returns."""
+    """Whether the policy leaves these methods as SB3 wrote them, and nothing changes what a module, or its gradient, is."""
     if any(map(_is_changed, policy.modules())) or any(method in vars(policy) for method in methods):
         return False
     # A policy that `torch.compile` has wrapped is of a class without any
@@ -132,9 +149,11 @@ def _inherits(policy: ActorCriticPolicy, *methods: str) -> bool:
 
 
 def _is_changed(module: nn.Module) -> bool:
-    """Whether a hook, or a method put in the place of the class's own, may change what it returns."""
-    replaced = vars(module).keys() & {"forward", "forward_actor", "forward_critic"}
-    return bool(replaced or module._forward_hooks or module._forward_pre_hooks)
+    """
+    Whether a method put in the place of the class's own, or a forward hook, may change what the module returns, or a
+    backward hook the gradient that goes through it.
+    """
+    return has_hook(module) or bool(vars(module).keys() & {"forward", "forward_actor", "forward_critic"})
 
 
 def _features(policy: ActorCriticPolicy, observations: PyTorchObs, extractor: BaseFeaturesExtractor) -> th.Tensor:

@@ -46,7 +46,7 @@ def mean_kl(old: ActionDistribution, new: ActionDistribution) -> th.Tensor:
     return divergence.reshape(len(divergence), -1).sum(dim=1).mean()
 
 
-def is_known(distribution: Distribution) -> bool:
+def has_known_metric(distribution: Distribution) -> bool:
     """
     :param distribution: a policy's ``action_dist``
     :return: whether its Fisher metric is known in closed form; a subclass may be something else
@@ -58,7 +58,7 @@ def distribution_from_outputs(
     distribution: Distribution, outputs: th.Tensor, log_std: Sequence[th.Tensor]
 ) -> ActionDistribution:
     """
-    :param distribution: a policy's ``action_dist`` that :func:`is_known`; refilled, unless it is a Gaussian
+    :param distribution: a policy's ``action_dist`` that :func:`has_known_metric`; refilled, unless it is a Gaussian
     :param outputs: means or logits of the last layer, shape (B, n_out)
     :param log_std: for a Gaussian, one tensor of shape (n_actions,); nothing for the others
     :return: the distribution with these outputs
@@ -100,8 +100,8 @@ def _softmax_metric(tangents: th.Tensor, probabilities: th.Tensor) -> th.Tensor:
     return weighted - probabilities * weighted.sum(dim=1, keepdim=True)
 
 
+# A Gaussian policy's is not here: what stands in for SB3's distribution has it
 _FISHER_METRICS: dict[type, Callable[[Any], OutputMetric]] = {
-    DiagonalGaussian: _gaussian_metric,
     CategoricalDistribution: _categorical_metric,
     MultiCategoricalDistribution: _multi_categorical_metric,
     BernoulliDistribution: _bernoulli_metric,
@@ -118,4 +118,6 @@ def fisher_metric(distribution: ActionDistribution) -> OutputMetric:
     :param distribution: of :func:`distribution_from_outputs`, without a graph
     :return: applies :math:`M` to the output tangents of a slice of the batch
     """
+    if isinstance(distribution, DiagonalGaussian):
+        return _gaussian_metric(distribution)
     return _FISHER_METRICS[type(distribution)](distribution)

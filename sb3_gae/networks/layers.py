@@ -27,6 +27,16 @@ def pair_up(layers: Sequence[nn.Module]) -> list[tuple[nn.Linear, nn.Module | No
     return pairs
 
 
+def has_hook(of: nn.Module | th.Tensor) -> bool:
+    """
+    :param of: a module, or a leaf of the computation graph
+    :return: whether something is called, and may change what it returns, where it is evaluated or its gradient is computed
+    """
+    if isinstance(of, th.Tensor):
+        return bool(of._backward_hooks)
+    return bool(of._forward_hooks or of._forward_pre_hooks or of._backward_hooks or of._backward_pre_hooks)
+
+
 class StepNetwork:
     """
     Layers of an MLP on the CPU, applied to the few rows of a step: by NumPy, a call of which costs a fraction of torch's.
