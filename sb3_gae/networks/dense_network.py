@@ -50,7 +50,7 @@ class DenseNetwork:
         return (
             bool(pairs)
             and all(type(linear) is nn.Linear and (act is None or has_known_derivative(act)) for linear, act in pairs)
-            and not any(has_hook(each) for each in (*layers, *parameters))
+            and not (any(map(has_hook, layers)) or any(map(has_hook, parameters)))
             and all(parameter.requires_grad for parameter in parameters)
             and len({id(parameter) for parameter in parameters}) == len(parameters)
         )
