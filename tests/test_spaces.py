@@ -91,6 +91,22 @@ def test_normalized_environments_train(observations: str) -> None:
     assert np.abs(model.rollout_buffer.rewards).max() < 25.0, "the buffer holds what the wrapper makes of the rewards"
 
 
+@pytest.mark.parametrize("key", [None, "ram"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64])
+def test_integers_that_were_normalized_are_trained_on_as_the_policy_saw_them(dtype: type, key: str | None) -> None:
+    """Not cut to whole numbers again, which is the type that VecNormalize leaves their space."""
+    ram = spaces.Box(0, 255, (4,), dtype)
+    space = ram if key is None else spaces.Dict({key: ram})
+    model = small_model(VecNormalize(vec_env(lambda: AnySpacesEnv(space))), "MlpPolicy" if key is None else "MultiInputPolicy")
+    check_training(model)
+    seen: Any = model._last_obs
+    train_once(model)
+    stored: Any = model.rollout_buffer.observations
+    seen, stored = (seen, stored) if key is None else (seen[key], stored[key])
+    np.testing.assert_array_equal(stored[0], seen)
+    assert (stored != np.round(stored)).any(axis=(1, 2)).all()
+
+
 def test_discrete_actions_count_from_0_whatever_the_start_of_the_space_as_in_sb3() -> None:
     """SB3's environment checker says that it does not support these; nothing here hides that."""
     with pytest.raises(AssertionError, match=r"is not in Discrete\(3, start=7\)"):

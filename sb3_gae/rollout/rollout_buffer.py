@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
 from stable_baselines3.common.type_aliases import DictRolloutBufferSamples, RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
@@ -130,6 +131,8 @@ class GAERolloutBuffer(RolloutBuffer):
         if counts is not None:
             self.mask[self.pos] = counts
         self._store_observations(obs)
+        if isinstance(self.action_space, spaces.Box):
+            self.actions = _able_to_hold(action, self.actions)
         self.actions[self.pos] = action.reshape(self.n_envs, self.action_dim)
         self.rewards[self.pos] = reward
         self.episode_starts[self.pos] = episode_start
@@ -140,6 +143,7 @@ class GAERolloutBuffer(RolloutBuffer):
         self.full = self.pos == self.buffer_size
 
     def _store_observations(self, obs: Any) -> None:
+        self.observations = _able_to_hold(obs, self.observations)
         self.observations[self.pos] = obs.reshape(self.n_envs, *self.obs_shape)
 
     def finish(self) -> None:
@@ -258,8 +262,19 @@ class GAEDictRolloutBuffer(GAERolloutBuffer, DictRolloutBuffer):
 
     def _store_observations(self, obs: Any) -> None:
         for key, array in self.observations.items():
+            self.observations[key] = array = _able_to_hold(obs[key], array)
             array[self.pos] = obs[key].reshape(array.shape[1:])
 
     def _get_samples(self, batch_inds: np.ndarray | slice, env: VecNormalize | None = None) -> Any:
         observations = {key: self._samples_of(array, batch_inds) for key, array in self.observations.items()}
         return DictRolloutBufferSamples(observations, *self._scalars_of(batch_inds))
+
+
+def _able_to_hold(values: np.ndarray, array: np.ndarray) -> np.ndarray:
+    """
+    The array itself, or a copy as wide as the values where these are floats and it would cut them to whole numbers.
+
+    SB3 gives an array the type of its space. But ``VecNormalize`` makes floats of vectors of integers and leaves their space
+    as it is, and a Gaussian policy draws floats for a space of integers.
+    """
+    return array.astype(values.dtype) if array.dtype.kind in "iu" and values.dtype.kind == "f" else array
