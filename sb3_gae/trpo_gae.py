@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from sb3_gae.batch import TrainingBatch, random_subset, standardized
+from sb3_gae.borrowed_distribution import borrowed_distribution
 from sb3_gae.hyperparameters import check_batch, check_hyperparameters, warn_of_unused
 from sb3_gae.lambda_rules import LambdaRule
 from sb3_gae.networks.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
@@ -242,7 +243,7 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
         if not parameters.of_policy:
             raise ValueError("The action distribution depends on no trainable parameter; give the policy layers.")
         # Attention's fused kernels have no second derivative
-        with all_or_nothing(self.policy), sdpa_kernel(SDPBackend.MATH):
+        with all_or_nothing(self.policy), borrowed_distribution(self.policy), sdpa_kernel(SDPBackend.MATH):
             if self.value_fit_first:
                 value_record = self._fit_value(batch, parameters)
                 self._estimate_advantages(self.rollout_buffer)

@@ -12,6 +12,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gae.batch import batch_size, take
+from sb3_gae.borrowed_distribution import borrowed_distribution
 
 # Rows of one pass: bounds the memory of a graph, and the length of sums in single precision
 _CHUNK_ROWS = 4096
@@ -65,7 +66,7 @@ def _chunk_gradients(
     advantages: th.Tensor,
 ) -> np.ndarray:
     """One graph, one pass backward for each row of advantages: shape (K, P)."""
-    with th.enable_grad():
+    with borrowed_distribution(policy), th.enable_grad():
         log_prob = policy.get_distribution(observations).log_prob(actions)
     result = np.empty((len(advantages), sum(parameter.numel() for parameter in parameters)))
     for row, weights in enumerate(advantages):

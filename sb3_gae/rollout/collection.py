@@ -195,13 +195,13 @@ def take_steps(
     :raises NumericalError: if an observation, action or reward is not finite
     """
     if plan.use_sde:
-        policy.reset_noise(env.num_envs)
+        _reset_noise(policy, env.num_envs)
     sample = ActionSampler(policy, first_env)
     for step in range(plan.n_steps):
         if quota.is_met:
             return
         if plan.use_sde and plan.sde_sample_freq > 0 and step % plan.sde_sample_freq == 0:
-            policy.reset_noise(env.num_envs)
+            _reset_noise(policy, env.num_envs)
         actions = sample(observations, step)
         clipped_actions = environment_actions(policy, actions)
         result = step_environments(env, clipped_actions)
@@ -214,6 +214,12 @@ def take_steps(
             observations, episode_starts, actions, clipped_actions, new_observations, rewards, dones, infos, env.num_envs
         )
         observations, episode_starts = new_observations, dones
+
+
+def _reset_noise(policy: ActorCriticPolicy, n_envs: int) -> None:
+    # Nothing differentiates by the noise, and a policy that holds a graph cannot be copied
+    with th.no_grad():
+        policy.reset_noise(n_envs)
 
 
 def reported_episodes(dones: np.ndarray, infos: Sequence[dict[str, Any]], counts: np.ndarray | None = None) -> np.ndarray:

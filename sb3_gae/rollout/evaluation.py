@@ -9,6 +9,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import obs_as_tensor
 
 from sb3_gae.batch import TrainingBatch, as_float, in_chunks
+from sb3_gae.borrowed_distribution import borrowed_distribution
 from sb3_gae.checks import check_finite_rollout
 from sb3_gae.estimators.advantages import discounted_returns
 from sb3_gae.rollout.collection import Observations, RolloutEnd, TerminalObservation, stacked
@@ -32,7 +33,8 @@ def evaluate_rollout(policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer
         values, log_probs, _ = policy.evaluate_actions(observations, actions)
         return th.stack([values.flatten(), log_probs], dim=1)
 
-    evaluated = in_chunks(evaluate, samples.observations, actions).cpu().numpy()
+    with borrowed_distribution(policy):
+        evaluated = in_chunks(evaluate, samples.observations, actions).cpu().numpy()
     values, log_probs = np.zeros((2, *mask.shape), dtype=evaluated.dtype)
     values[mask], log_probs[mask] = evaluated.T
     check_finite_rollout("value", values)

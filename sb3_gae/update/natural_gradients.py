@@ -13,6 +13,7 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae.batch import TrainingBatch
+from sb3_gae.borrowed_distribution import borrowed_distribution
 from sb3_gae.networks.dense_policy import has_dense_policy
 from sb3_gae.networks.parameters import positions
 from sb3_gae.update.kronecker import WIDEST_LAYER
@@ -90,5 +91,6 @@ def _prepared_fisher(policy: ActorCriticPolicy, parameters: Sequence[th.Tensor],
     # Evenly spaced: random ones would come out of the generator that training draws from
     spread = th.arange(0, len(batch), -(-len(batch) // _MOST_SAMPLES), device=batch.advantages.device)
     part = batch.take(spread)
-    fisher = DenseFisher(policy, part.observations)
+    with borrowed_distribution(policy):
+        fisher = DenseFisher(policy, part.observations)
     return fisher if fisher.prepare(part.actions) else None

@@ -9,6 +9,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gae.batch import TrainingBatch
+from sb3_gae.borrowed_distribution import borrowed_distribution
 from sb3_gae.networks.dense_policy import dense_policy_network, has_dense_policy, policy_log_std
 from sb3_gae.networks.distributions import ActionDistribution, distribution_from_outputs, fisher_metric, mean_kl, snapshot
 from sb3_gae.networks.parameters import flat_gradient, influencing_in_batch, influencing_parameters
@@ -27,9 +28,10 @@ def policy_parameters(policy: ActorCriticPolicy, batch: TrainingBatch) -> list[t
     def log_prob(part: TrainingBatch) -> th.Tensor:
         return policy.get_distribution(part.observations).log_prob(part.actions)
 
-    # Every sample goes through all of an MLP: one of them is enough there
-    found = influencing_parameters(log_prob(batch.first()), policy.parameters())
-    return found if has_dense_policy(policy, found) else influencing_in_batch(log_prob, policy.parameters(), batch)
+    with borrowed_distribution(policy):
+        # Every sample goes through all of an MLP: one of them is enough there
+        found = influencing_parameters(log_prob(batch.first()), policy.parameters())
+        return found if has_dense_policy(policy, found) else influencing_in_batch(log_prob, policy.parameters(), batch)
 
 
 def policy_step(
