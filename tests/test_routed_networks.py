@@ -68,6 +68,23 @@ def test_all_experts_are_trained(share: bool) -> None:
     assert moved_experts(model, "vf_features_extractor") == [True, True]
 
 
+@pytest.mark.parametrize("batch_size", [1, 3])
+def test_adam_leaves_alone_what_no_sample_of_a_minibatch_goes_through(batch_size: int) -> None:
+    """A minibatch of one sample misses one of the experts; of those of three some do."""
+    policy_kwargs = {"share_features_extractor": False}
+    model = routed_model(vf_optimizer="adam", batch_size=batch_size, policy_kwargs=policy_kwargs)
+    assert moved_experts(model, "vf_features_extractor") == [True, True]
+    assert all(parameter.grad is None for parameter in model.policy.parameters())
+
+
+def test_adam_passes_over_minibatches_that_reach_nothing_trainable() -> None:
+    model = routed_model(vf_optimizer="adam", batch_size=1, policy_kwargs={"share_features_extractor": False})
+    extractor: Any = model.policy.vf_features_extractor
+    for frozen in (model.policy.value_net, extractor.experts[0]):
+        frozen.requires_grad_(False)
+    assert moved_experts(model, "vf_features_extractor") == [False, True]
+
+
 def test_the_value_fit_leaves_alone_what_the_policy_depends_on_in_any_state(monkeypatch: pytest.MonkeyPatch) -> None:
     """The critic sees what both experts say; the actor, in any one state, what one of them does."""
     model = routed_model()

@@ -37,8 +37,12 @@ def adam_fit(
     for _ in range(n_epochs if parameters else 0):
         for samples in rollout_buffer.get(batch_size):
             errors = (policy.predict_values(samples.observations).flatten() - samples.returns) / scale
-            gradients = th.autograd.grad(F.mse_loss(errors, th.zeros_like(errors)), parameters)
-            if not all(th.isfinite(gradient).all() for gradient in gradients):
+            # These samples may go through frozen parts alone
+            if not errors.requires_grad:
+                continue
+            # None for parts of a network that none of these samples goes through
+            gradients = th.autograd.grad(F.mse_loss(errors, th.zeros_like(errors)), parameters, allow_unused=True)
+            if not all(th.isfinite(gradient).all() for gradient in gradients if gradient is not None):
                 raise NumericalError("A gradient of the value function contains NaN or infinity.")
             policy.optimizer.zero_grad()
             for parameter, gradient in zip(parameters, gradients, strict=True):
