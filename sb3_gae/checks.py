@@ -1,10 +1,12 @@
 """Refusals of bad input, in words that say what would be right."""
 
 import math
+from collections.abc import Iterable
 from numbers import Real
 from typing import Any
 
 import numpy as np
+import torch as th
 from torch import nn
 
 from sb3_gae.errors import NumericalError
@@ -75,6 +77,23 @@ def check_finite_parameters(module: nn.Module) -> None:
             raise NumericalError(
                 f"The policy's parameter {name!r} contains NaN or infinity; nothing can be learnt from there."
             )
+
+
+def is_about_numbers(error: ValueError, parameters: Iterable[th.Tensor]) -> bool:
+    """
+    Tell an action distribution that there is none of from whatever else a policy of the user's own may raise.
+
+    :param error: that asking the policy has led to
+    :param parameters: of the policy
+    :return: whether torch refused to make the distribution, or a trainable parameter is not finite
+    """
+    innermost = error.__traceback__
+    while innermost is not None and innermost.tb_next is not None:
+        innermost = innermost.tb_next
+    raised_in = "" if innermost is None else innermost.tb_frame.f_globals.get("__name__", "")
+    return raised_in.startswith("torch.distributions") or not all(
+        parameter.isfinite().all() for parameter in parameters if parameter.requires_grad
+    )
 
 
 def check_finite_step(what: str, array: np.ndarray | dict[str, np.ndarray], step: int, first_env: int = 0) -> None:

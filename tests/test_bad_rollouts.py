@@ -151,17 +151,19 @@ def test_a_bad_action_distribution_is_refused(
     check_refused(model, r"action.* step 3 of the rollout")
 
 
-def test_an_error_of_the_network_itself_is_not_one_of_numbers() -> None:
+@pytest.mark.parametrize("error", [RuntimeError("out of memory"), ValueError("too many values to unpack")], ids=repr)
+def test_an_error_of_the_network_itself_is_not_one_of_numbers(error: Exception) -> None:
     model = short_model(vec_env(lambda: AnySpacesEnv(VECTOR, spaces.Discrete(3))))
-    errors = [RuntimeError("out of memory")]
+    errors = [error]
 
     def fail_once(module: Any, inputs: Any, outputs: th.Tensor) -> None:
         if errors:
             raise errors.pop()
 
     model.policy.action_net.register_forward_hook(fail_once)
-    with pytest.raises(RuntimeError, match="out of memory"):
+    with pytest.raises(type(error), match=str(error)) as raised:
         train_once(model)
+    assert raised.value is error
 
 
 class BadEvaluation(MlpPolicy):

@@ -12,6 +12,8 @@ from envs_for_tests import differing, optimizer_state, short_model, state_of, tr
 import sb3_gae.update.policy_step
 import sb3_gae.update.value_step
 from sb3_gae import MlpPolicy
+from sb3_gae.checks import is_about_numbers
+from sb3_gae.update.shared_parameters import SharedParameters
 
 
 def spoil(monkeypatch: pytest.MonkeyPatch, step: Any, **changes: Any) -> None:
@@ -124,3 +126,37 @@ def test_a_trial_without_a_distribution_is_a_trial_that_failed(validate_args: bo
     logged = train_once(model)
     assert set(refusals) == {validate_args}
     assert logged["train/is_line_search_success"] == 1.0 and logged["train/line_search_trials"] > len(refusals)
+
+
+@pytest.mark.parametrize("owner", [sb3_gae.update.policy_step._SurrogateAndDivergence, SharedParameters])
+def test_an_error_of_the_network_itself_ends_an_update(owner: type, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a trial of the policy step, and where the value fit looks how far it has moved what both share."""
+    shared = {"vf_kl_fraction": 0.1, "policy_kwargs": {"net_arch": [8], "activation_fn": th.nn.CELU}}
+    model = short_model(policy="SharedMlpPolicy", **shared)
+    train_once(model)
+    before, method, asked = state_of(model.policy), "divergence" if owner is SharedParameters else "__call__", []
+    real = getattr(owner, method)
+    monkeypatch.setattr(owner, method, lambda self: (asked.append(True), real(self))[1])
+
+    def fail(module: Any, inputs: Any, outputs: th.Tensor) -> None:
+        if asked:
+            asked.clear()
+            raise ValueError("too many values to unpack")
+
+    model.policy.action_net.register_forward_hook(fail)
+    with pytest.raises(ValueError, match="too many values to unpack"):
+        train_once(model)
+    assert differing(before, state_of(model.policy)) == []
+
+
+def test_which_errors_are_about_numbers() -> None:
+    """Those of a distribution that torch refuses to make, and any where a parameter that is trained has gone bad."""
+    good, bad = th.nn.Parameter(th.zeros(2)), th.nn.Parameter(th.tensor([0.0, math.inf]))
+    with pytest.raises(ValueError, match="parameter loc") as refused:
+        th.distributions.Normal(th.tensor(math.nan), 1.0)
+    with pytest.raises(ValueError, match="invalid literal") as other:
+        int("x")
+    assert is_about_numbers(refused.value, [good])
+    assert is_about_numbers(other.value, [good, bad])
+    assert not is_about_numbers(other.value, [good, bad.requires_grad_(False)])
+    assert not is_about_numbers(ValueError("never raised"), [good])

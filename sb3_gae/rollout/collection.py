@@ -11,7 +11,7 @@ from stable_baselines3.common.utils import obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from sb3_gae.checks import check_finite_step
+from sb3_gae.checks import check_finite_step, is_about_numbers
 from sb3_gae.errors import NumericalError
 from sb3_gae.networks.dense_policy import gaussian_layers
 from sb3_gae.networks.layers import StepNetwork, pair_up
@@ -149,8 +149,12 @@ class ActionSampler:
                 return self._policy._predict(obs_as_tensor(observations, self._policy.device)).cpu().numpy()
         except (ValueError, RuntimeError) as error:
             # A distribution refuses its parameters by the first. Where `torch.compile` has switched that check off for the
-            # whole process, drawing from them fails by the second, and so does much else.
-            if isinstance(error, RuntimeError) and self._has_distribution(observations):
+            # whole process, drawing from them fails by the second. And so does much else, which is the user's to know of.
+            if isinstance(error, ValueError):
+                of_distribution = is_about_numbers(error, self._policy.parameters())
+            else:
+                of_distribution = not self._has_distribution(observations)
+            if not of_distribution:
                 raise
             raise NumericalError(f"The action distribution is invalid at step {step} of the rollout: {error}") from error
 

@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_gae.batch import TrainingBatch
 from sb3_gae.borrowed_distribution import borrowed_distribution
+from sb3_gae.checks import is_about_numbers
 from sb3_gae.networks.dense_policy import dense_policy_network, has_dense_policy, policy_log_std
 from sb3_gae.networks.distributions import ActionDistribution, distribution_from_outputs, fisher_metric, mean_kl, snapshot
 from sb3_gae.networks.parameters import flat_gradient, influencing_in_batch, influencing_parameters
@@ -64,6 +65,7 @@ def policy_step(
 class _SurrogateAndDivergence:
     """Surrogate and mean KL divergence of the policy as it now is, from the policy as it was."""
 
+    parameters: Sequence[th.Tensor]
     distribution: Callable[[], ActionDistribution]
     actions: th.Tensor
     advantages: th.Tensor
@@ -76,9 +78,11 @@ class _SurrogateAndDivergence:
                 new = self.distribution()
                 surrogate = _surrogate(self.advantages, new.log_prob(self.actions), self.old_log_prob)
                 return surrogate.item(), mean_kl(self.old, new).item()
-        except ValueError:
+        except ValueError as error:
             # torch refuses distribution parameters that are not finite: too long a step, not an error of the user's. Where
             # `torch.compile` has switched that check off, both are NaN, which the search rejects, too.
+            if not is_about_numbers(error, self.parameters):
+                raise
             return -math.inf, math.inf
 
 
@@ -108,7 +112,7 @@ def _autograd_problem(
         objective=surrogate.item(),
         gradient=flat_gradient(surrogate, parameters),
         curvature=autograd_fisher_product(policy, parameters, curvature_batch.observations),
-        evaluate=_SurrogateAndDivergence(distribution, batch.actions, advantages, old, old_log_prob),
+        evaluate=_SurrogateAndDivergence(parameters, distribution, batch.actions, advantages, old, old_log_prob),
     )
 
 
@@ -140,7 +144,7 @@ def _dense_problem(
         gradient=th.cat([network.vjp(cotangents), *log_std_gradient]),
         curvature=fisher.product,
         precondition=fisher.precondition if fisher.prepare(curvature_batch.actions) else None,
-        evaluate=_SurrogateAndDivergence(distribution, batch.actions, advantages, old, log_prob.detach()),
+        evaluate=_SurrogateAndDivergence(parameters, distribution, batch.actions, advantages, old, log_prob.detach()),
     )
 
 

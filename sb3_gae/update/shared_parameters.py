@@ -15,6 +15,7 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae.batch import TrainingBatch
+from sb3_gae.checks import is_about_numbers
 from sb3_gae.networks.dense_policy import has_dense_policy
 from sb3_gae.networks.distributions import mean_kl, snapshot
 from sb3_gae.networks.parameters import influencing_in_batch, positions
@@ -118,8 +119,10 @@ class SharedParameters:
         try:
             with th.no_grad():
                 divergence = mean_kl(self._start, self._policy.get_distribution(self._observations)).item()
-        except ValueError:
+        except ValueError as error:
             # torch refuses distribution parameters that are not finite: too long a step
+            if not is_about_numbers(error, self._policy.parameters()):
+                raise
             return math.inf
         # `torch.compile` has switched that check off for the whole process
         return math.inf if math.isnan(divergence) else divergence
