@@ -76,13 +76,16 @@ def batch_size(observations: PyTorchObs) -> int:
     return len(next(iter(observations.values())) if isinstance(observations, dict) else observations)
 
 
-def as_float(observations: PyTorchObs) -> PyTorchObs:
+def as_float(observations: PyTorchObs, precision: th.dtype = th.float32) -> PyTorchObs:
     """
-    Floats in the policy's precision, so that not every pass over the batch converts them; integers stay.
+    Floats no more precise than the policy, so that not every pass over the batch converts them; integers stay.
 
     :param observations: shape (B, ...), or a dictionary of such
+    :param precision: of the policy; in double precision it gets all as it had it when it acted
     :return: likewise
     """
+    if precision == th.float64:
+        return observations
     if isinstance(observations, dict):
         return {key: value.float() if value.is_floating_point() else value for key, value in observations.items()}
     return observations.float() if observations.is_floating_point() else observations

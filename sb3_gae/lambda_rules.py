@@ -12,7 +12,7 @@ from sb3_gae.checks import check_choice, check_count, check_number, check_unit_i
 from sb3_gae.diagnostics.rollout_diagnostics import METRICS, expected_improvement, has_several_trajectories, lambda_errors
 from sb3_gae.estimators.advantages import discounted_returns
 from sb3_gae.estimators.measures import explained_variance
-from sb3_gae.rollout.evaluation import training_batch
+from sb3_gae.rollout.evaluation import precision_of, training_batch
 from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer
 from sb3_gae.update.natural_gradients import has_natural_gradients
 from sb3_gae.update.policy_step import policy_parameters
@@ -235,7 +235,7 @@ class MeasuredLambda:
     def _metric_for(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> str:
         if self.metric == "euclidean":
             return self.metric
-        batch = training_batch(rollout_buffer, policy.action_space)
+        batch = training_batch(rollout_buffer, policy.action_space, precision_of(policy))
         known = has_natural_gradients(policy, policy_parameters(policy, batch), batch)
         return self.metric if known else "euclidean"
 

@@ -15,7 +15,7 @@ from sb3_gae.hyperparameters import check_batch, check_hyperparameters, warn_of_
 from sb3_gae.lambda_rules import LambdaRule
 from sb3_gae.networks.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, SharedMlpPolicy
 from sb3_gae.on_policy_algorithm import GAEOnPolicyAlgorithm
-from sb3_gae.rollout.evaluation import training_batch
+from sb3_gae.rollout.evaluation import precision_of, training_batch
 from sb3_gae.saving.portable_model import PortableModel
 from sb3_gae.saving.resumable import ResumableModel
 from sb3_gae.update.adam_fit import adam_fit
@@ -238,7 +238,7 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
         # Evaluation mode: the line search must compare one function, and batch statistics would move at each trial
         self.policy.set_training_mode(False)
         self._update_learning_rate(self.policy.optimizer)
-        batch = training_batch(self.rollout_buffer, self.action_space)
+        batch = self._training_batch()
         parameters = self._parameter_groups(batch)
         if not parameters.of_policy:
             raise ValueError("The action distribution depends on no trainable parameter; give the policy layers.")
@@ -247,12 +247,15 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
             if self.value_fit_first:
                 value_record = self._fit_value(batch, parameters)
                 self._estimate_advantages(self.rollout_buffer)
-                policy_record = self._step_policy(training_batch(self.rollout_buffer, self.action_space), parameters)
+                policy_record = self._step_policy(self._training_batch(), parameters)
             else:
                 policy_record = self._step_policy(batch, parameters)
                 value_record = self._fit_value(batch, parameters)
         self._n_updates += 1
         self._log_update(policy_record, value_record, batch.value_targets)
+
+    def _training_batch(self) -> TrainingBatch:
+        return training_batch(self.rollout_buffer, self.action_space, precision_of(self.policy))
 
     def _parameter_groups(self, batch: TrainingBatch) -> ParameterGroups:
         of_policy = policy_parameters(self.policy, batch)

@@ -2,16 +2,19 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
-from envs_for_tests import check_training, differing, small_model, state_of, train_once, vec_env
+from envs_for_tests import VECTOR, AnySpacesEnv, check_training, differing, small_model, state_of, train_once, vec_env
 from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_gae import TRPOGAE, MlpPolicy
+from sb3_gae import TRPOGAE, GradientDiagnosticsCallback, MlpPolicy
 from sb3_gae.rollout.collection import ActionSampler
+
+DOUBLE_ACTIONS = spaces.Box(-1.0, 1.0, (2,), np.float64)
 
 
 class OwnNames(ActorCriticPolicy):
@@ -35,9 +38,39 @@ class OwnNames(ActorCriticPolicy):
         return self.get_distribution(observation).get_actions(deterministic)
 
 
+class DoublePrecision(OwnNames):
+    """Its parameters are doubles; observations come as they are."""
+
+    def _build(self, lr_schedule: Any) -> None:
+        super()._build(lr_schedule)
+        self.double()
+
+    def get_distribution(self, obs: Any) -> Any:
+        return self.action_dist.proba_distribution(self.act(obs), self.log_std)
+
+    def predict_values(self, obs: Any) -> th.Tensor:
+        return self.judge(obs)
+
+
 class ColumnValues(MlpPolicy):
     def predict_values(self, obs: Any) -> th.Tensor:
         return super().predict_values(obs)
+
+
+class Doubles(BaseFeaturesExtractor):
+    """SB3 makes single precision of all observations before."""
+
+    def __init__(self, observation_space: spaces.Box):
+        super().__init__(observation_space, features_dim=3)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return observations.double()
+
+
+class DoubleMlp(MlpPolicy):
+    def _build(self, lr_schedule: Any) -> None:
+        super()._build(lr_schedule)
+        self.double()
 
 
 class FlatValues(MlpPolicy):
@@ -196,6 +229,23 @@ def test_hooks_on_gradients_of_modules_count_while_they_are_there(register: str)
     hook.remove()
     check_training(model, 1)
     assert [name for name in differing(before, state_of(policy)) if "policy_net" in name]
+
+
+@pytest.mark.parametrize("options", [{}, {"vf_optimizer": "adam"}, {"baseline": "time"}, {"gae_lambda": "auto"}], ids=str)
+def test_a_policy_in_double_precision_gets_the_observations_in_it_wherever_it_is_asked(options: dict[str, Any]) -> None:
+    env = vec_env(lambda: AnySpacesEnv(spaces.Box(-1.0, 1.0, (3,), np.float64), DOUBLE_ACTIONS))
+    model = small_model(env, DoublePrecision, policy_kwargs={}, **options)
+    for _ in range(2):
+        assert train_once(model, GradientDiagnosticsCallback([0.9]))["train/is_line_search_success"] == 1.0
+    assert {parameter.dtype for parameter in model.policy.parameters()} == {th.float64}
+
+
+@pytest.mark.parametrize("actions", [DOUBLE_ACTIONS, spaces.Discrete(3), spaces.MultiBinary(2)], ids=str)
+@pytest.mark.parametrize("share", [True, False])
+def test_an_mlp_in_double_precision_trains(share: bool, actions: spaces.Space) -> None:
+    env = vec_env(lambda: AnySpacesEnv(VECTOR, actions))
+    policy_kwargs = {"net_arch": [8], "features_extractor_class": Doubles, "share_features_extractor": share}
+    check_training(small_model(env, DoubleMlp, policy_kwargs=policy_kwargs))
 
 
 def test_a_policy_needs_none_of_sb3s_layers() -> None:

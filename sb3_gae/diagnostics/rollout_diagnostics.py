@@ -18,7 +18,7 @@ from sb3_gae.estimators.advantages import advantage_grid, td_residuals
 from sb3_gae.estimators.group_statistics import Estimate, gradient_errors, squared_norm
 from sb3_gae.estimators.response import lagged_signal
 from sb3_gae.estimators.trajectory_groups import trajectory_groups, trajectory_indices
-from sb3_gae.rollout.evaluation import training_batch
+from sb3_gae.rollout.evaluation import precision_of, training_batch
 from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer
 from sb3_gae.update.natural_gradients import natural_gradients
 from sb3_gae.update.policy_step import policy_parameters
@@ -126,7 +126,7 @@ def lambda_errors(
     sums, groups = _gradient_sums(policy, rollout_buffer, advantages, n_groups)
     steps = duals = None
     if metric == "fisher":
-        batch = training_batch(rollout_buffer, policy.action_space)
+        batch = training_batch(rollout_buffer, policy.action_space, precision_of(policy))
         steps, duals = natural_gradients(policy, policy_parameters(policy, batch), batch, sums)
     errors = gradient_errors(sums, np.bincount(groups), duals=duals, steps=steps)
     bias, variance, norm, product = (Estimate(*(array[:-1] for array in each)) for each in errors)
@@ -208,7 +208,7 @@ def _gradient_sums(
     """Sums over groups, shape (G, K, P), for signals of shape (K, T, N); and the group of each step of the batch, (B,)."""
     mask = rollout_buffer.mask
     groups = trajectory_groups(rollout_buffer.dones, n_groups, mask)[mask]
-    batch = training_batch(rollout_buffer, policy.action_space)
+    batch = training_batch(rollout_buffer, policy.action_space, precision_of(policy))
     parameters = policy_parameters(policy, batch)
     sums = policy_gradients(policy, parameters, batch.observations, batch.actions, signals[:, mask], groups)
     return sums, groups

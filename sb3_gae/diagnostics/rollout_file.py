@@ -18,7 +18,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_gae.checks import check_number
 from sb3_gae.diagnostics.projected_scores import projected_scores
-from sb3_gae.rollout.evaluation import training_batch
+from sb3_gae.rollout.evaluation import precision_of, training_batch
 from sb3_gae.rollout.rollout_buffer import GAERolloutBuffer
 
 FORMAT = "sb3-gae rollout 1"
@@ -98,7 +98,7 @@ def record(policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer, name: st
     belongs = rollout_buffer.mask[:n_steps].copy()
     arrays = rollout_buffer.rewards, rollout_buffer.values, rollout_buffer.next_values, rollout_buffer.dones
     rewards, values, next_values, dones = (np.where(belongs, array[:n_steps], 0).astype(array.dtype) for array in arrays)
-    scores = projected_scores(policy, training_batch(rollout_buffer, policy.action_space), N_DIMENSIONS)
+    scores = projected_scores(policy, training_batch(rollout_buffer, policy.action_space, precision_of(policy)), N_DIMENSIONS)
     return Rollout(name, float(rollout_buffer.gamma), float(gae_lambda), rewards, values, next_values, dones, belongs, scores)
 
 

@@ -52,15 +52,26 @@ def distribution_actions(action_space: spaces.Space, actions: th.Tensor) -> th.T
     return actions.long().flatten() if isinstance(action_space, spaces.Discrete) else actions
 
 
-def training_batch(rollout_buffer: GAERolloutBuffer, action_space: spaces.Space) -> TrainingBatch:
+def precision_of(policy: ActorCriticPolicy) -> th.dtype:
+    """
+    :param policy: any actor-critic policy
+    :return: double precision if it has any parameter in it, else single
+    """
+    return th.float64 if any(parameter.dtype == th.float64 for parameter in policy.parameters()) else th.float32
+
+
+def training_batch(
+    rollout_buffer: GAERolloutBuffer, action_space: spaces.Space, precision: th.dtype = th.float32
+) -> TrainingBatch:
     """
     :param rollout_buffer: full, with its advantages computed
     :param action_space: of the environment
+    :param precision: see :func:`precision_of`
     :return: all of it, flattened, as the steps of an update take it
     """
     samples = rollout_buffer.batch()
     actions = distribution_actions(action_space, samples.actions)
-    return TrainingBatch(as_float(samples.observations), actions, samples.advantages, samples.returns)
+    return TrainingBatch(as_float(samples.observations, precision), actions, samples.advantages, samples.returns)
 
 
 def reward_returns(rollout_buffer: GAERolloutBuffer) -> np.ndarray:
