@@ -70,10 +70,11 @@ def check_unit_interval(name: str, factors: Any) -> None:
 def check_finite_parameters(module: nn.Module) -> None:
     """
     :param module: any
-    :raises NumericalError: if any number in a parameter is NaN or infinite
+    :raises NumericalError: if any number in a trainable parameter is NaN or infinite. A frozen one may be so on purpose, as a
+        mask of attention is; whether it does harm, outputs and gradients show
     """
     for name, parameter in module.named_parameters():
-        if not parameter.isfinite().all():
+        if parameter.requires_grad and not parameter.isfinite().all():
             raise NumericalError(
                 f"The policy's parameter {name!r} contains NaN or infinity; nothing can be learnt from there."
             )

@@ -207,7 +207,8 @@ def check_training(model: TRPOGAE, iterations: int = 2) -> None:
         assert probe.kl() == pytest.approx(logged["train/kl_divergence_loss"], rel=1e-3, abs=1e-6)
         assert logged["train/vf_steps"] >= 1
         assert logged["train/vf_kl_divergence"] <= model.vf_trust_region
-    assert all(tensor.isfinite().all() for tensor in model.policy.state_dict().values())
+    trained = [parameter for parameter in model.policy.parameters() if parameter.requires_grad]
+    assert all(tensor.isfinite().all() for tensor in (*trained, *model.policy.buffers()))
     observations = model.get_env().reset()
     for deterministic in (True, False):
         actions, _ = model.predict(observations, deterministic=deterministic)

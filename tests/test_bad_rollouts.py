@@ -12,6 +12,7 @@ from envs_for_tests import (
     VECTOR,
     AnySpacesEnv,
     BadNumberEnv,
+    check_training,
     differing,
     short_model,
     state_of,
@@ -20,6 +21,8 @@ from envs_for_tests import (
     vec_env_of,
 )
 from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
 
 from sb3_gae import MlpPolicy, NumericalError
 from sb3_gae.rollout.collection import RolloutPlan, take_steps
@@ -123,6 +126,47 @@ def test_a_bad_parameter_is_named(bad: float, name: str) -> None:
     with pytest.raises(NumericalError, match=f"parameter '{name}' contains NaN or infinity"):
         train_once(model)
     assert differing(before, {name: tensor.nan_to_num(7.0) for name, tensor in state_of(model.policy).items()}) == []
+
+
+FROZEN = [
+    "action_net.weight",
+    "log_std",
+    "mlp_extractor.policy_net.0.bias",
+    "value_net.bias",
+    "mlp_extractor.value_net.0.weight",
+]
+
+
+@pytest.mark.parametrize("vf_optimizer", ["trust_region", "adam"])
+@pytest.mark.parametrize("name", FROZEN)
+def test_a_bad_parameter_that_is_frozen_is_refused_by_what_it_does(name: str, vf_optimizer: str) -> None:
+    model = short_model(vf_optimizer=vf_optimizer)
+    train_once(model)
+    frozen = model.policy.get_parameter(name).requires_grad_(False)
+    with th.no_grad():
+        frozen.view(-1)[-1] = math.nan
+    before = {name: tensor.nan_to_num(7.0) for name, tensor in state_of(model.policy).items()}
+    with pytest.raises(NumericalError, match="(action|value) contains NaN at step 0"):
+        train_once(model)
+    assert differing(before, {name: tensor.nan_to_num(7.0) for name, tensor in state_of(model.policy).items()}) == []
+
+
+class Masked(BaseFeaturesExtractor):
+    """Mixes the numbers of a vector, each with those before it alone."""
+
+    def __init__(self, observation_space: spaces.Box):
+        super().__init__(observation_space, features_dim=3)
+        self.scores = nn.Parameter(th.zeros(3, 3))
+        self.mask = nn.Parameter(th.full((3, 3), -math.inf).triu(1), requires_grad=False)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return observations @ th.softmax(self.scores + self.mask, dim=1).T
+
+
+@pytest.mark.parametrize("share", [True, False])
+def test_a_frozen_mask_of_infinity_is_no_bad_number(share: bool) -> None:
+    policy_kwargs = {"net_arch": [8], "features_extractor_class": Masked, "share_features_extractor": share}
+    check_training(short_model(policy_kwargs=policy_kwargs))
 
 
 @pytest.mark.parametrize(
