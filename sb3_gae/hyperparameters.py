@@ -29,6 +29,12 @@ FOREIGN_ARGUMENTS: dict[str, str] = {
     "rms_prop_eps": _STEP_SIZE,
 }
 
+_CHOICES: dict[str, tuple[Any, ...]] = {
+    "vf_optimizer": ("trust_region", "adam"),
+    "baseline": ("value", "time"),
+    **dict.fromkeys(("value_fit_first", "normalize_advantage", "normalize_value"), (False, True)),
+}
+
 
 def warn_of_unused(adam_arguments: Mapping[str, Any], vf_optimizer: str, foreign_arguments: Mapping[str, Any]) -> None:
     """
@@ -81,9 +87,8 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
         check_count("n_episodes", values["n_episodes"])
     if values["curvature_samples"] is not None:
         check_count("curvature_samples", values["curvature_samples"], low=2)
-    check_choice("vf_optimizer", values["vf_optimizer"], ("trust_region", "adam"))
-    check_choice("baseline", values["baseline"], ("value", "time"))
-    check_choice("value_fit_first", values["value_fit_first"], (False, True))
+    for name, choices in _CHOICES.items():
+        check_choice(name, values[name], choices)
     if values["baseline"] == "time" and (values["value_fit_first"] or values["_lambda_rule"] is not None):
         raise ValueError(
             "`baseline` = 'time' has neither a value function to fit first nor a lambda to choose; leave out "
@@ -120,13 +125,17 @@ def check_batch(n_steps: int, n_envs: int, sub_sampling_factor: int, n_episodes:
     if n_samples < 2:
         raise ValueError(
             f"A batch needs at least 2 samples, but `n_steps` = {n_steps} in {n_envs} environment(s) with "
-            f"`sub_sampling_factor` = {sub_sampling_factor} gives {n_samples}; raise `n_steps`."
+            f"`sub_sampling_factor` = {sub_sampling_factor} gives {n_samples}; raise `n_steps` or "
+            "lower `sub_sampling_factor`."
         )
 
 
-def _check_buffer_class(buffer_class: type | None) -> None:
-    if buffer_class is not None and not issubclass(buffer_class, GAERolloutBuffer):
+def _check_buffer_class(buffer_class: Any) -> None:
+    if buffer_class is None:
+        return
+    if not (isinstance(buffer_class, type) and issubclass(buffer_class, GAERolloutBuffer)):
         raise TypeError(
-            f"`rollout_buffer_class` must be a subclass of sb3_gae.GAERolloutBuffer, got {buffer_class.__name__}: "
+            f"`rollout_buffer_class` must be a subclass of sb3_gae.GAERolloutBuffer, got "
+            f"{getattr(buffer_class, '__name__', repr(buffer_class))}: "
             "SB3's own buffers do not keep terminations and truncations apart."
         )

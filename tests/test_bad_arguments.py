@@ -24,6 +24,7 @@ from sb3_gae import GAEDictRolloutBuffer, MlpPolicy
             for name in ("n_steps", "cg_max_steps", "vf_cg_max_steps", "line_search_max_iter", "sub_sampling_factor")
             for value in (0, -1, 2.5, True)
         ],
+        *[(name, "False") for name in ("value_fit_first", "normalize_advantage", "normalize_value")],
         *[(name, value) for name in ("vf_steps", "n_critic_updates") for value in (-1, 1.5)],
         *[("batch_size", value) for value in (0, 1.5)],
         *[("curvature_samples", value) for value in (0, 1, 2.5)],
@@ -96,7 +97,7 @@ def test_a_frozen_action_distribution_is_refused_and_the_value_function_stays() 
     assert differing(before, state_of(model.policy)) == []
 
 
-@pytest.mark.parametrize("buffer_class", [RolloutBuffer, dict])
+@pytest.mark.parametrize("buffer_class", [RolloutBuffer, dict, "GAERolloutBuffer"])
 def test_another_kind_of_buffer_is_refused(buffer_class: Any) -> None:
     with pytest.raises(TypeError, match=r"`rollout_buffer_class` must be a subclass of sb3_gae\.GAERolloutBuffer"):
         short_model(rollout_buffer_class=buffer_class)

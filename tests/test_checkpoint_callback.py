@@ -56,6 +56,29 @@ def test_the_checkpoints_of_a_training_that_is_ahead_are_not_mixed_with(
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_what_kept_training_from_starting_is_not_hidden_behind_its_end(checkpoints: Path, tmp_path: Path) -> None:
+    """rl-zoo3 tells callbacks of the end of training in a `finally`."""
+    ResumableCheckpointCallback(1, tmp_path).on_training_end()
+    copy_of(checkpoints, tmp_path)
+    model, callback = make_model(cart_poles()), ResumableCheckpointCallback(1, tmp_path)
+    with pytest.raises(ValueError, match="--trained-agent"):
+        model.learn(STEPS, callback=callback)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    callback.on_training_end()
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", None])
+def test_a_training_that_made_its_environment_of_an_id_goes_on_with_the_id(env: str | None, tmp_path: Path) -> None:
+    model = TRPOGAE("MlpPolicy", "CartPole-v1", n_steps=STEPS, seed=0, device="cpu")
+    model.learn(2 * STEPS, callback=ResumableCheckpointCallback(1, tmp_path))
+    if env is None:
+        with pytest.raises(ValueError, match="`env` must be an environment"):
+            TRPOGAE.resume(tmp_path, env)  # type: ignore[arg-type]
+    else:
+        assert TRPOGAE.resume(tmp_path, env).num_timesteps == 2 * STEPS
+
+
 def test_a_checkpoint_is_a_model_that_sb3_and_the_zoo_load(checkpoints: Path) -> None:
     model = TRPOGAE.load(checkpoints / "rl_model_256_steps.zip")
     assert model.num_timesteps == 4 * STEPS

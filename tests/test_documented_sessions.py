@@ -207,7 +207,7 @@ def results_of_another_machine() -> None:
 
 
 def checkpoints_as_the_page_makes_them() -> None:
-    train = ["rl_zoo3.train", "--algo", "trpo_gae", "--env", "CartPole-v1", "-n", "4096", "--eval-freq", "-1"]
+    train = ["rl_zoo3.train", "--algo", "trpo_gae", "--env", "CartPole-v1", "-n", "8192", "--eval-freq", "-1"]
     small = ["-params", "n_envs:2", "n_steps:64"]
     (callback,) = re.findall(r'"(callback:\[.*\])"', (ROOT / "docs" / "checkpoints.md").read_text())
     run([*train, *small, callback])

@@ -230,6 +230,23 @@ def test_the_first_rollout_has_the_values_of_a_critic_that_was_trained_before(ho
     assert th.equal(policy.predict_values(th.ones(1, 2)), before)
 
 
+def test_a_vector_of_parameters_means_the_same_in_every_policy() -> None:
+    """Whatever the scales of the two."""
+    source, target = small_policy(MlpPolicy), small_policy(MlpPolicy)
+    source.value_net.update_scale(th.tensor([300.0, 400.0]))
+    target.value_net.update_scale(th.tensor([0.03, 0.04]))
+    observations = th.randn(8, 2)
+    expected = source.predict_values(observations)
+    vector = source.parameters_to_vector()
+    plain = small_policy(ActorCriticPolicy)
+    for policy in (target, plain, source):
+        policy.load_from_vector(vector)
+        th.testing.assert_close(policy.predict_values(observations), expected)
+    plain.load_from_vector(plain.parameters_to_vector())
+    target.load_from_vector(plain.parameters_to_vector())
+    th.testing.assert_close(target.predict_values(observations), expected)
+
+
 # --- Copies and files ---
 
 

@@ -2,9 +2,11 @@
 
 import itertools
 
+import numpy as np
 from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy, MultiInputActorCriticPolicy
 from stable_baselines3.common.type_aliases import Schedule
 from torch import nn
+from torch.nn.utils import parameters_to_vector
 
 from sb3_gae.networks.value_head import ValueHead
 
@@ -15,6 +17,26 @@ class _ScaledValues(ActorCriticPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         self.value_net = ValueHead(self.value_net)
+
+    def parameters_to_vector(self) -> np.ndarray:
+        """
+        :return: all parameters, those of the last value layer times its scale, so that they mean the same in a policy of SB3,
+            shape (n,)
+        """
+        # Users replace layers
+        if not isinstance(head := self.value_net, ValueHead):
+            return super().parameters_to_vector()
+        scaled = {id(parameter) for parameter in head.parameters()}
+        pieces = [each.detach() * head.scale if id(each) in scaled else each.detach() for each in self.parameters()]
+        return parameters_to_vector(pieces).cpu().numpy()
+
+    def load_from_vector(self, vector: np.ndarray) -> None:
+        """
+        :param vector: as :meth:`parameters_to_vector` gives it, here or in a policy of SB3, shape (n,)
+        """
+        super().load_from_vector(vector)
+        if isinstance(head := self.value_net, ValueHead):
+            head.forget_scale()
 
 
 class MlpPolicy(_ScaledValues):

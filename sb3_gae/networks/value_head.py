@@ -89,6 +89,13 @@ class ValueHead(nn.Linear):
                 self.bias.mul_(ratio)
             self.scale.copy_(new_scale)
 
+    @th.no_grad()
+    def forget_scale(self) -> None:
+        """Weights and bias are in units of the reward, as those of a plain layer. A head without a scale may still get one."""
+        if self.n_batches != 0 or self.scale != 1.0:
+            self.scale.fill_(1.0)
+            self.n_batches.fill_(1)
+
     def _save_to_state_dict(self, destination: dict[str, Any], prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
         if self.n_batches == 0 and not self.is_as_constructed:

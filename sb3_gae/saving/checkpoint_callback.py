@@ -81,6 +81,7 @@ class ResumableCheckpointCallback(BaseCallback):
         self.save_path.mkdir(parents=True, exist_ok=True)
 
     def _on_training_start(self) -> None:
+        self._fresh = []
         check_hears_of_rollouts(self)
         self._check_folder()
         root = self.locals["callback"]
@@ -108,7 +109,8 @@ class ResumableCheckpointCallback(BaseCallback):
         if newer:
             raise ValueError(
                 f"`save_path` = {str(self.save_path)!r} has checkpoints of a training that is ahead, such as {newer[0].name}. "
-                "Continue it with TRPOGAE.resume, take another folder, or delete them."
+                "Continue it with TRPOGAE.resume (in rl-zoo3 with --trained-agent and a checkpoint), take another folder, or "
+                "delete them."
             )
 
     def _on_rollout_start(self) -> None:
@@ -121,6 +123,9 @@ class ResumableCheckpointCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
+        if not self._fresh:
+            # rl-zoo3 also tells of the end where an error has kept training from starting, which this must not hide
+            return
         updates = self._rollout_start[1]
         # In the middle of a rollout there is nothing to go on from: its steps would be missing
         if self._progress == self._rollout_start or self._progress[1] > updates:

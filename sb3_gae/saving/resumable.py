@@ -9,6 +9,7 @@ from contextlib import ExitStack
 from typing import Any, ClassVar, Self
 
 import torch as th
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_gae.errors import WorkersLostError
@@ -33,7 +34,7 @@ class ResumableModel(SavedModel):
     def resume(
         cls,
         path: str | os.PathLike[str],
-        env: GymEnv,
+        env: GymEnv | str,
         device: th.device | str = "auto",
         force_reset: bool = False,
         **kwargs: Any,
@@ -50,16 +51,19 @@ class ResumableModel(SavedModel):
 
         :param path: folder that :class:`~sb3_gae.ResumableCheckpointCallback` wrote to, for the newest checkpoint that is
             whole; or one checkpoint
-        :param env: made as that of the training, in the same wrappers; their state comes from the checkpoint
+        :param env: made as that of the training, in the same wrappers, or its id if the model made it of one; its state comes
+            from the checkpoint
         :param device: on which to run
         :param force_reset: whether to begin new episodes although the environments could go on with theirs
         :param kwargs: as for ``load``; they replace what was saved
         :return: a new model
         :raises FileNotFoundError: if there is no checkpoint
-        :raises ValueError: if none is whole, or the environment is another
+        :raises ValueError: if none is whole, or the environment is another, or none
         """
+        if env is None:
+            raise ValueError("`env` must be an environment made as that of the training, in the same wrappers, got None.")
         file, content = newest_checkpoint(path)
-        model = cls.load(io.BytesIO(content), env=env, device=device, force_reset=False, **kwargs)
+        model = cls.load(io.BytesIO(content), env=maybe_make_env(env, verbose=0), device=device, force_reset=False, **kwargs)
         state = pickle.loads(state_in(content))
         made = model.get_env()
         assert made is not None
