@@ -29,6 +29,11 @@ FOREIGN_ARGUMENTS: dict[str, str] = {
     "rms_prop_eps": _STEP_SIZE,
 }
 
+_LEAST_COUNTS = {
+    **dict.fromkeys(("n_steps", "cg_max_steps", "vf_cg_max_steps", "line_search_max_iter"), 1),
+    **dict.fromkeys(("sub_sampling_factor", "batch_size"), 1),
+    **dict.fromkeys(("vf_steps", "n_critic_updates"), 0),
+}
 _CHOICES: dict[str, tuple[Any, ...]] = {
     "vf_optimizer": ("trust_region", "adam"),
     "baseline": ("value", "time"),
@@ -79,10 +84,8 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
     for name in ("cg_tolerance", "vf_kl_fraction"):
         check_number(name, values[name], 0.0, 1.0, below=True)
     check_number("line_search_shrinking_factor", values["line_search_shrinking_factor"], 0.0, 1.0, above=True, below=True)
-    for name in ("n_steps", "cg_max_steps", "vf_cg_max_steps", "line_search_max_iter", "sub_sampling_factor", "batch_size"):
-        check_count(name, values[name])
-    for name in ("vf_steps", "n_critic_updates"):
-        check_count(name, values[name], low=0)
+    for name, low in _LEAST_COUNTS.items():
+        check_count(name, values[name], low)
     if values["n_episodes"] is not None:
         check_count("n_episodes", values["n_episodes"])
     if values["curvature_samples"] is not None:
