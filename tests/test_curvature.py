@@ -431,6 +431,17 @@ def test_preconditioners_are_symmetric_and_positive_and_bring_the_first_step_nea
     assert errors["preconditioned"] < 0.8 * errors["plain"]
 
 
+@each_space
+def test_scores_can_be_asked_for_again(action_space: spaces.Space) -> None:
+    policy = double_policy(action_space)
+    batch = training_batch(policy, N_SAMPLES)
+    fisher, fresh = (DenseFisher(policy, batch.observations) for _ in range(2))
+    assert fisher.prepare(batch.actions)
+    again, expected = fisher.output_moments(batch.actions), fresh.output_moments(batch.actions)
+    assert again.keys() == expected.keys()
+    assert all(th.equal(again[linear], expected[linear]) for linear in expected)
+
+
 # --- Which parameters ---
 
 

@@ -220,7 +220,8 @@ class DenseFisher:
         return {linear: outputs for (linear, _), (_, outputs) in zip(self._network.layers, factors, strict=True)}
 
     def _scores(self, actions: th.Tensor) -> th.Tensor:
-        (scores,) = th.autograd.grad(self._distribution.log_prob(actions).sum(), self._outputs)
+        # The distribution's own part of the graph serves every call
+        (scores,) = th.autograd.grad(self._distribution.log_prob(actions).sum(), self._outputs, retain_graph=True)
         return scores
 
     def precondition(self, vector: th.Tensor, damping: float) -> th.Tensor:
