@@ -146,7 +146,7 @@ def test_a_bad_parameter_that_is_frozen_is_refused_by_what_it_does(name: str, vf
     with th.no_grad():
         frozen.view(-1)[-1] = math.nan
     before = {name: tensor.nan_to_num(7.0) for name, tensor in state_of(model.policy).items()}
-    with pytest.raises(NumericalError, match="(action|value) contains NaN at step 0"):
+    with pytest.raises(NumericalError, match=r"(action|value) contains NaN at step 0"):
         train_once(model)
     assert differing(before, {name: tensor.nan_to_num(7.0) for name, tensor in state_of(model.policy).items()}) == []
 
