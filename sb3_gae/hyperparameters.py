@@ -77,10 +77,7 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
     for name in ("target_kl", "vf_trust_region"):
         check_number(name, values[name], 0.0, above=True, below=True)
     check_number("cg_damping", values["cg_damping"], 0.0, below=True)
-    if isinstance(values["vf_cg_damping"], str):
-        check_choice("vf_cg_damping", values["vf_cg_damping"], ("auto",))
-    else:
-        check_number("vf_cg_damping", values["vf_cg_damping"], 0.0, below=True)
+    _check_vf_cg_damping(values["vf_cg_damping"])
     for name in ("cg_tolerance", "vf_kl_fraction"):
         check_number(name, values[name], 0.0, 1.0, below=True)
     check_number("line_search_shrinking_factor", values["line_search_shrinking_factor"], 0.0, 1.0, above=True, below=True)
@@ -99,8 +96,16 @@ def check_hyperparameters(values: Mapping[str, Any]) -> None:
         )
     _check_vf_kl_fraction(values)
     _check_buffer_class(values["rollout_buffer_class"])
-    if "value_lambda" in values["rollout_buffer_kwargs"]:
-        raise ValueError("Pass `value_lambda` to TRPOGAE itself and not in `rollout_buffer_kwargs`.")
+    for name in ("gamma", "gae_lambda", "value_lambda"):
+        if name in values["rollout_buffer_kwargs"]:
+            raise ValueError(f"Pass `{name}` to TRPOGAE itself and not in `rollout_buffer_kwargs`.")
+
+
+def _check_vf_cg_damping(damping: Any) -> None:
+    if not isinstance(damping, str):
+        check_number("vf_cg_damping", damping, 0.0, below=True)
+    elif damping != "auto":
+        raise ValueError(f"`vf_cg_damping` must be a number in [0, inf) or 'auto', got {damping!r}.")
 
 
 def _check_vf_kl_fraction(values: Mapping[str, Any]) -> None:

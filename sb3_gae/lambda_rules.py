@@ -68,9 +68,9 @@ class ScheduledLambda:
         :return: what the schedule says, for the batch to come
         :raises ValueError: if that is no number in [0, 1]
         """
-        value = float(self.schedule(progress_remaining))
+        value = self.schedule(progress_remaining)
         check_number("gae_lambda", value, 0.0, 1.0)
-        return value
+        return float(value)
 
     def learn_from(self, policy: ActorCriticPolicy, rollout_buffer: GAERolloutBuffer) -> dict[str, float]:
         """

@@ -169,7 +169,7 @@ class GAEOnPolicyAlgorithm(OnPolicyAlgorithm):
             counts = quota.counts
             truncated = np.zeros(env.num_envs, dtype=bool)
             if (reported := reported_episodes(dones, infos, counts)).size:
-                self._update_info_buffer([infos[env] for env in reported.tolist()], dones[reported])
+                self._update_info_buffer([infos[index] for index in reported.tolist()], dones[reported])
             if dones.any():
                 endings = self._record_endings(n_steps, dones, dones if counts is None else dones & counts, infos)
                 terminal.extend(endings)
@@ -195,7 +195,7 @@ class GAEOnPolicyAlgorithm(OnPolicyAlgorithm):
         self, step: int, dones: np.ndarray, counted: np.ndarray, infos: list[dict[str, Any]]
     ) -> list[TerminalObservation]:
         """Log what else is said of ends, and return the episodes of the batch that a time limit ended."""
-        self._numerical_failures += sum(bool(infos[env].get("numerical_failure")) for env in np.flatnonzero(dones))
+        self._numerical_failures += sum(bool(infos[index].get("numerical_failure")) for index in np.flatnonzero(dones))
         if self._numerical_failures:
             self.logger.record("rollout/numerical_failures", self._numerical_failures)
         return terminal_observations(step, counted, infos)

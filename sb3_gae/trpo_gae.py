@@ -84,7 +84,8 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
         argument has no effect
     :param cg_tolerance: conjugate gradient ends when a step adds less than this part of what all have added,
         for policy and value function; 0 runs to the largest number of steps or to convergence
-    :param vf_optimizer: ``"trust_region"``, or ``"adam"`` for the fit of sb3-contrib's TRPO
+    :param vf_optimizer: ``"trust_region"``, or ``"adam"`` for the fit of sb3-contrib's TRPO, which reads no other ``vf_``
+        argument
     :param normalize_value: whether the value network's outputs are in units of a running scale of the returns
     :param curvature_samples: largest number of samples that curvature products use, drawn at random; None for all.
         Gradients, objectives and constraints use every sample, but for the policy step's with ``sub_sampling_factor``
@@ -334,9 +335,12 @@ class TRPOGAE(ResumableModel, PortableModel, GAEOnPolicyAlgorithm):
         :return: this model
         :raises NumericalError: if a number that must be finite is not, or the linear algebra breaks down; policy and optimiser
             are then as they were after the last update
-        :raises ValueError: if a schedule or rule of ``gae_lambda`` leaves [0, 1], the action distribution depends on no
-            trainable parameter, or the environments are too few for a batch
+        :raises ValueError: if an attribute has been set to what the constructor refuses, a schedule or rule of
+            ``gae_lambda`` leaves [0, 1], the action distribution depends on no trainable parameter, or the environments are
+            too few for a batch
         :raises WorkersLostError: if workers are gone and cannot be replaced; the message says how to go on
         """
+        # Attributes may have been set since
+        self._check_arguments()
         self._check_batch()
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)

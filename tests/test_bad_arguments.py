@@ -133,3 +133,19 @@ def test_settings_that_are_changed_later_are_those_that_count() -> None:
     model.gamma, model.gae_lambda = 0.9, 0.0
     train_once(model)
     assert np.abs(buffer.returns - buffer.advantages - buffer.values).max() > 1e-2, "targets have a lambda of their own"
+
+
+def test_settings_that_are_changed_later_are_checked_before_training_goes_on() -> None:
+    model = short_model()
+    train_once(model)
+    before = state_of(model.policy)
+    model.target_kl = -0.01
+    with pytest.raises(ValueError, match="`target_kl` must be"):
+        model.learn(1)
+    assert differing(before, state_of(model.policy)) == []
+
+
+@pytest.mark.parametrize("name", ["gamma", "gae_lambda", "value_lambda"])
+def test_the_buffer_has_these_numbers_from_the_algorithm_alone(name: str) -> None:
+    with pytest.raises(ValueError, match=f"Pass `{name}` to TRPOGAE itself"):
+        short_model(rollout_buffer_kwargs={name: 0.5})

@@ -48,6 +48,7 @@ def test_a_signal_ends_training_after_the_iteration_with_a_checkpoint_and_a_mess
     printed, notice = capfd.readouterr()
     assert "ends after this iteration" in notice
     assert f"Stopped by {number.name} after {2 * STEPS} timesteps; {2 * STEPS} are left." in printed
+    assert f"--trained-agent and the newest checkpoint in {tmp_path / 'stopped'}." in printed
     # What the message says, typed
     line, learn = [line.strip() for line in printed.splitlines() if line.startswith("    ")]
     names: dict[str, Any] = {"TRPOGAE": TRPOGAE, "env": cart_poles(), "callback": None, "everything": everything}

@@ -343,9 +343,10 @@ def test_other_values_are_refused(gae_lambda: Any) -> None:
         small_model(vec_env(), gae_lambda=gae_lambda)
 
 
-def test_a_schedule_that_leaves_the_interval_is_refused() -> None:
-    with pytest.raises(ValueError, match="`gae_lambda` must be a number in"):
-        small_model(vec_env(), gae_lambda=lambda progress: 2.0 * progress)
+@pytest.mark.parametrize("value", [2.0, -0.1, None, "0.9"])
+def test_a_schedule_that_leaves_the_interval_is_refused(value: Any) -> None:
+    with pytest.raises(ValueError, match=f"`gae_lambda` must be a number in .*, got {value!r}"):
+        small_model(vec_env(), gae_lambda=lambda progress: value)
 
 
 def test_what_was_measured_is_saved(tmp_path: Path) -> None:

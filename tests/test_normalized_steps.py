@@ -97,6 +97,13 @@ class Doubling(VecNormalize):
         return 2.0 * np.asarray(observations), *others
 
 
+def test_methods_that_were_replaced_in_one_environment_are_called() -> None:
+    envs = pair()
+    for env in envs:
+        env.normalize_obs = lambda observations: observations + 1.0  # type: ignore[method-assign,assignment]
+    assert_steps_agree(*envs)
+
+
 @pytest.mark.parametrize("wrapper", [Doubling, None])
 def test_other_environments_step_themselves(wrapper: type[VecNormalize] | None) -> None:
     ours, theirs = (env if wrapper is None else wrapper(env) for env in (seeded(), seeded()))

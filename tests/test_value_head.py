@@ -16,6 +16,7 @@ from torch import nn
 from sb3_gae import MlpPolicy
 from sb3_gae.networks.dense_policy import dense_value_network
 from sb3_gae.networks.value_head import ValueHead
+from sb3_gae.update.all_or_nothing import all_or_nothing
 
 
 def new_head(bias: bool = True, dtype: th.dtype = th.float64) -> ValueHead:
@@ -326,3 +327,25 @@ def test_the_dense_network_of_a_policy_gives_values_in_units_of_the_scale() -> N
     observations = th.randn(4, 2)
     values = dense_value_network(policy, observations).forward() * policy.value_net.scale
     th.testing.assert_close(values, policy.predict_values(observations).detach())
+
+
+# --- Undone updates ---
+
+
+@pytest.mark.parametrize("is_set", [False, True], ids=["as constructed", "set"])
+@pytest.mark.parametrize("has_scale", [False, True])
+def test_an_update_that_is_undone_leaves_no_trace(is_set: bool, has_scale: bool) -> None:
+    policy = MlpPolicy(spaces.Box(-1.0, 1.0, (3,)), spaces.Discrete(2), lambda _: 1e-3)
+    head = policy.value_net
+    assert isinstance(head, ValueHead)
+    if is_set:
+        nn.init.zeros_(head.weight)
+    if has_scale:
+        head.scale.fill_(5.0)
+    before = copy.deepcopy(head)
+    with pytest.raises(KeyboardInterrupt), all_or_nothing(policy):
+        head.update_scale(th.full((4,), 100.0))
+        raise KeyboardInterrupt
+    assert head.n_batches == 0
+    assert th.equal(head.scale, before.scale) and th.equal(head.weight, before.weight)
+    assert head.is_as_constructed is before.is_as_constructed

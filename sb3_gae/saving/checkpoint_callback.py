@@ -189,7 +189,8 @@ class ResumableCheckpointCallback(BaseCallback):
             f"Stopped by {number.name} after {self.model.num_timesteps} timesteps; {left} are left. To continue, in place of "
             f"making a new model:\n"
             f"    model = {kind}.resume({folder!r}, env)\n"
-            f"    model.learn(model.remaining_timesteps, callback=callback, reset_num_timesteps=False)",
+            f"    model.learn(model.remaining_timesteps, callback=callback, reset_num_timesteps=False)\n"
+            f"or in rl-zoo3 with --trained-agent and the newest checkpoint in {folder}.",
             flush=True,
         )
         self._signals.deliver()

@@ -18,12 +18,21 @@ def all_or_nothing(policy: ActorCriticPolicy) -> Iterator[None]:
     :param policy: whose parameters, buffers and optimiser are guarded
     :raises NumericalError: in place of the errors of linear algebra and arithmetic
     """
-    before = copy.deepcopy((policy.state_dict(), policy.optimizer.state_dict()))
+    # Not by `state_dict`: a layer may load as another than the one that was saved, as a value head without a scale does
+    before = {name: tensor.detach().clone() for name, tensor in _tensors(policy)}
+    optimizer = copy.deepcopy(policy.optimizer.state_dict())
     try:
         yield
     except BaseException as error:
-        policy.load_state_dict(before[0])
-        policy.optimizer.load_state_dict(before[1])
+        with th.no_grad():
+            for name, tensor in _tensors(policy):
+                tensor.copy_(before[name])
+        policy.optimizer.load_state_dict(optimizer)
         if isinstance(error, th.linalg.LinAlgError | ArithmeticError):
             raise NumericalError(f"The linear algebra of the update broke down: {error}") from error
         raise
+
+
+def _tensors(policy: ActorCriticPolicy) -> Iterator[tuple[str, th.Tensor]]:
+    yield from policy.named_parameters()
+    yield from policy.named_buffers()
