@@ -193,8 +193,10 @@ def _steps_a_task(base: gym.Env) -> bool:
 def _base_of(env: gym.Env) -> MujocoTaskEnv:
     base = env.unwrapped
     if not isinstance(base, MujocoTaskEnv):
-        raise ValueError(f"MujocoVecEnv steps environments of a MujocoTask, got {base}; use DummyVecEnv for it, "
-            "or EnvPoolVecEnv for MuJoCo tasks of gymnasium.")
+        raise ValueError(
+            f"MujocoVecEnv steps environments of a MujocoTask, got {base}; use DummyVecEnv for it, "
+            "or EnvPoolVecEnv for gymnasium's MuJoCo tasks."
+        )
     if not _steps_a_task(base):
         raise ValueError(
             f"MujocoVecEnv would pass by the `step` of {type(base).__name__}; say it in the functions of its MujocoTask, "
