@@ -76,8 +76,8 @@ bench-full: bench $(TIANSHOU)/.installed
 	$(IN_VENV) python -m benchmarks.speed profile
 	$(IN_VENV) python -m benchmarks.speed threads
 	$(IN_VENV) python -m benchmarks.speed report
-	$(IN_VENV) python benchmarks/first_results.py
-	$(IN_VENV) python benchmarks/paper_tasks.py
+	$(IN_VENV) python -m benchmarks.first_results
+	$(IN_VENV) python -m benchmarks.paper_tasks
 	$(IN_VENV) python -m benchmarks.peers run --jobs 2
 	$(IN_VENV) python -m benchmarks.peers export
 	$(IN_VENV) python -m benchmarks.peers report

@@ -1,8 +1,8 @@
 """
 What the shipped settings reach: rl-zoo3's own commands over several seeds, each agent played by a process of its own.
 
-    python benchmarks/first_results.py            # about an hour on two cores
-    python benchmarks/first_results.py --summary  # only the table, from the stored results
+    python -m benchmarks.first_results            # about an hour on two cores
+    python -m benchmarks.first_results --summary  # only the table, from the stored results
 
 Each run is ``python -m rl_zoo3.train --algo trpo_gae --env TASK --seed SEED`` with nothing else set, then
 ``python -m rl_zoo3.enjoy`` on the last agent (not the best), deterministic, for 20 whole episodes or more.
@@ -10,7 +10,6 @@ Rows are appended to results/first_results.csv as runs end; what stands there is
 """
 
 import argparse
-import csv
 import os
 import re
 import subprocess
@@ -22,6 +21,8 @@ from typing import NamedTuple
 
 import numpy as np
 from rliable import library, metrics
+
+from benchmarks.stored_rows import store, stored
 
 RESULTS = Path(__file__).parent / "results" / "first_results.csv"
 EVALUATION_SEED = 10_000
@@ -60,28 +61,10 @@ def zoo(verb: str, *arguments: str) -> str:
     return done.stdout
 
 
-def stored() -> list[dict[str, str]]:
-    if not RESULTS.exists():
-        return []
-    with RESULTS.open() as file:
-        return list(csv.DictReader(file))
-
-
-def store(row: dict[str, object]) -> None:
-    new = not RESULTS.exists()
-    RESULTS.parent.mkdir(exist_ok=True)
-    with RESULTS.open("a", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
-    print(row, flush=True)
-
-
 def summary() -> None:
     """Interquartile mean over seeds with a bootstrap interval of 95 %, as rliable computes them."""
     for task in TASKS:
-        returns = np.array([float(row["mean_return"]) for row in stored() if row["env"] == task.env])
+        returns = np.array([float(row["mean_return"]) for row in stored(RESULTS) if row["env"] == task.env])
         if len(returns) == 0:
             continue
         np.random.seed(0)
@@ -99,11 +82,13 @@ def main() -> None:
     parser.add_argument("--summary", action="store_true", help="run nothing")
     args = parser.parse_args()
     if not args.summary:
-        known = {(row["env"], int(row["seed"])) for row in stored()}
+        known = {(row["env"], int(row["seed"])) for row in stored(RESULTS)}
         left = [(task, seed) for task in TASKS for seed in task.seeds if (task.env, seed) not in known]
         with ThreadPoolExecutor(args.jobs) as pool:
             for done in as_completed([pool.submit(run, task, seed, args.folder) for task, seed in left]):
-                store(done.result())
+                row = done.result()
+                store(RESULTS, [row])
+                print(row, flush=True)
     summary()
 
 

@@ -1,10 +1,10 @@
 """
 What the shipped settings reach on the paper's tasks: rl-zoo3's own command over several seeds, and learning curves.
 
-    python benchmarks/paper_tasks.py                          # every run that is not stored yet: hours
-    python benchmarks/paper_tasks.py --tasks GaeBiped-v0 --seeds 0 1 2 --jobs 2
-    python benchmarks/paper_tasks.py --tasks GaeBiped-v0 --seeds 1000 --steps 50000000   # the paper's 1 000 iterations
-    python benchmarks/paper_tasks.py --report                 # runs nothing: the table, and the figure in docs/images
+    python -m benchmarks.paper_tasks                          # every run that is not stored yet: hours
+    python -m benchmarks.paper_tasks --tasks GaeBiped-v0 --seeds 0 1 2 --jobs 2
+    python -m benchmarks.paper_tasks --tasks GaeBiped-v0 --seeds 1000 --steps 50000000   # the paper's 1 000 iterations
+    python -m benchmarks.paper_tasks --report                 # runs nothing: the table, and the figure in docs/images
 
 Each run is ``python -m rl_zoo3.train --algo trpo_gae --env TASK --seed SEED`` with one thread of torch, then the last
 agent (not the best) plays 20 episodes, deterministically, in the gymnasium environment. A row and a curve are stored
@@ -13,7 +13,6 @@ figure has the seeds that are run by default.
 """
 
 import argparse
-import csv
 import os
 import subprocess
 import sys
@@ -30,6 +29,7 @@ from rliable import library, metrics
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from benchmarks.stored_rows import store, stored
 from sb3_gae import TRPOGAE
 from sb3_gae.zoo import default_hyperparams_path
 
@@ -39,7 +39,6 @@ FIGURE = Path(__file__).parents[1] / "docs" / "images" / "paper_tasks.svg"
 EPISODES = 20
 POINTS = 100
 COLUMNS = ["env", "seed", "steps", "train_seconds", "mean_return", "mean_length", "forward_velocity", "head_height"]
-CURVE_COLUMNS = ["env", "seed", "steps", "return"]
 
 
 class Task(NamedTuple):
@@ -74,7 +73,8 @@ def run(env: str, seed: int, steps: int | None, folder: Path) -> tuple[dict[str,
     seconds = round(time.perf_counter() - start)
     agent = max((logs / "trpo_gae").glob(f"{env}_*"), key=lambda path: int(path.name.rsplit("_", 1)[1]))
     points = [{"env": env, "seed": seed, **point} for point in curve(agent)]
-    return {"env": env, "seed": seed, "train_seconds": seconds, **play(env, agent, seed)}, points
+    row = {"env": env, "seed": seed, "train_seconds": seconds, **play(env, agent, seed)}
+    return {name: row[name] for name in COLUMNS}, points
 
 
 def curve(agent: Path) -> list[dict[str, object]]:
@@ -117,16 +117,6 @@ def play(env_id: str, agent: Path, seed: int) -> dict[str, object]:
     return {"steps": model.num_timesteps} | {name: round(float(np.mean(values)), 3) for name, values in means.items()}
 
 
-def store(path: Path, columns: list[str], rows: list[dict[str, object]]) -> None:
-    new = not path.exists()
-    path.parent.mkdir(exist_ok=True)
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        if new:
-            writer.writeheader()
-        writer.writerows(rows)
-
-
 def is_known(env: str, seed: int, steps: int | None) -> bool:
     """Whether such a run is stored; the last batch of a run goes beyond what was asked for."""
     asked = steps or int(float(yaml.safe_load(default_hyperparams_path().read_text())[env]["n_timesteps"]))
@@ -134,13 +124,6 @@ def is_known(env: str, seed: int, steps: int | None) -> bool:
         (row["env"], int(row["seed"])) == (env, seed) and 0 <= int(row["steps"]) - asked < 0.02 * asked
         for row in stored(RESULTS)
     )
-
-
-def stored(path: Path) -> list[dict[str, str]]:
-    if not path.exists():
-        return []
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 def table() -> None:
@@ -209,8 +192,8 @@ def run_all(pairs: list[tuple[str, int]], args: argparse.Namespace) -> list[str]
             except subprocess.CalledProcessError as error:
                 failures.append(f"{runs[done]}: exit status {error.returncode}, see output.txt in {args.folder}")
                 continue
-            store(CURVES, CURVE_COLUMNS, points)
-            store(RESULTS, COLUMNS, [row])
+            store(CURVES, points)
+            store(RESULTS, [row])
             print(row, flush=True)
     return failures
 

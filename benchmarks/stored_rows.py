@@ -23,14 +23,15 @@ def stored(path: Path) -> list[dict[str, str]]:
 def store(path: Path, rows: Iterable[dict[str, Any]]) -> None:
     """
     :param path: of the file, made if there is none
-    :param rows: to be added, all with the same keys; floats keep four digits
+    :param rows: to be added, all with the same keys in the same order
     """
     rows, new = list(rows), not path.exists()
+    path.parent.mkdir(exist_ok=True)
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         if new:
             writer.writeheader()
-        writer.writerows({name: f"{v:.4g}" if isinstance(v, float) else v for name, v in row.items()} for row in rows)
+        writer.writerows(rows)
 
 
 def measure(
@@ -46,7 +47,7 @@ def measure(
     :param description: of the command
     :param path: of the file
     :param agents: task and seed of each
-    :param rows_of: measures one, with columns ``env`` and ``seed``
+    :param rows_of: measures one, with columns ``env`` and ``seed``; of floats four digits are stored
     :param summary: of all that is stored
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -56,5 +57,9 @@ def measure(
     known = {(row["env"], int(row["seed"])) for row in stored(path)}
     for env_id, seed in agents:
         if not args.summary and (env_id, seed) not in known:
-            store(path, rows_of(env_id, seed))
+            store(path, map(_shortened, rows_of(env_id, seed)))
     print(summary())
+
+
+def _shortened(row: dict[str, Any]) -> dict[str, Any]:
+    return {name: f"{value:.4g}" if isinstance(value, float) else value for name, value in row.items()}

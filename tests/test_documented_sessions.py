@@ -33,9 +33,9 @@ SMALLER = {
     "benchmarks.speed profile": "--quick --output seconds.json",
     "benchmarks/update_speed.py": "--rounds 1 --batch-size 512",
     "benchmarks/soak.py": "--minutes 0.05",
-    "benchmarks/paper_tasks.py": "--report",
+    "benchmarks.paper_tasks": "--report",
     # What is committed has been run: it says so, and prints the table
-    "benchmarks/first_results.py": "",
+    "benchmarks.first_results": "",
     "benchmarks/ray_scaling_model.py": "",
     "benchmarks.value_fit_error": "",
     "benchmarks.policy_step_gain": "",
