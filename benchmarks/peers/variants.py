@@ -259,6 +259,16 @@ HUMANOID_CANDIDATES = {
             {"cg_damping": 10.0, "vf_cg_damping": 3.0},
         ),
         (
+            "policy-damping-30",
+            "KL 0.03, damping of the policy step 30, of the value fit 3",
+            {"cg_damping": 30.0, "vf_cg_damping": 3.0},
+        ),
+        (
+            "policy-damping-100",
+            "KL 0.03, damping of the policy step 100, of the value fit 3",
+            {"cg_damping": 100.0, "vf_cg_damping": 3.0},
+        ),
+        (
             "kl-.06-both-dampings",
             "KL 0.06, damping of the policy step 10, of the value fit 3",
             {"target_kl": 0.06, "cg_damping": 10.0, "vf_cg_damping": 3.0},
