@@ -30,7 +30,7 @@ TUNING_TASKS = ("Walker2d-v5", "Hopper-v5", "HalfCheetah-v5", "Ant-v5", "Swimmer
 TUNING_STEPS = 500_000
 PENDULUM = "Pendulum-v1"
 #: as many as tell a tenth of the return from chance
-PENDULUM_TUNING_SEEDS = range(100, 106)
+PENDULUM_TUNING_SEEDS = range(100, 112)
 SWIMMER = "Swimmer-v5"
 #: as many as tell a quarter of all agents from half of them
 SWIMMER_TUNING_SEEDS = range(110, 118)
