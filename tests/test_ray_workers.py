@@ -1,7 +1,10 @@
 """Workers on Ray itself: the same training wherever they run, and what happens when they, or Ray, are killed."""
 
 import os
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -183,3 +186,35 @@ def test_without_ray_the_training_ends_with_a_checkpoint_that_can_be_continued(
     model = TRPOGAE.resume(tmp_path, VecNormalize(make_env()))
     model.learn(model.remaining_timesteps, reset_num_timesteps=False)
     assert differences(expected, everything(model)) == []
+
+
+_WITHOUT_PARENT = """
+import os, sys, time
+from sb3_gae.workers.crew import import_ray
+
+while os.getppid() == int(sys.argv[1]):
+    time.sleep(0.01)
+ray = import_ray()
+ray.init(num_cpus=1, include_dashboard=False, _node_ip_address="127.0.0.1", object_store_memory=80 * 2**20)
+for processes in ray._private.worker._global_node.all_processes.values():
+    for process in processes:
+        process.process.kill()
+        process.process.wait()
+ray.shutdown()
+print("still here", flush=True)
+"""
+
+
+def test_a_process_whose_parent_has_ended_outlives_ray(tmp_path: Path) -> None:
+    """Ray's own rule, by which it would end, is of workers; a container's first process starts trainings that way, and `nohup`."""
+    script, output = tmp_path / "script.py", tmp_path / "output.txt"
+    script.write_text(_WITHOUT_PARENT)
+    output.touch()
+    # A shell that starts it and ends
+    shell = f'"{sys.executable}" "{script}" $$ > "{output}" 2>&1 &'
+    env = {name: value for name, value in os.environ.items() if name != "RAY_RAYLET_PID"}
+    subprocess.run(["sh", "-c", shell], check=True, env=env)
+    deadline = time.monotonic() + 120.0
+    while "still here" not in output.read_text() and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert "still here" in output.read_text(), output.read_text()

@@ -2,6 +2,7 @@
 
 import os
 import socket
+import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -223,16 +224,29 @@ def ensure_ray(n_cpus: int) -> ModuleType:
     :return: the module
     :raises ImportError: if Ray is not installed
     """
-    # Nothing here reports to anybody unless the user asks for it
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    try:
-        import ray
-    except ImportError as error:
-        raise ImportError('Workers need Ray: pip install "sb3-gae[ray]"') from error
+    ray = import_ray()
     if not ray.is_initialized():
         try:
             ray.init(num_cpus=max(n_cpus, os.cpu_count() or 1), include_dashboard=False)
         except ValueError:
             # There is a cluster, whose size is not ours to say
             ray.init()
+    return ray
+
+
+def import_ray() -> ModuleType:
+    """
+    :return: the module
+    :raises ImportError: if Ray is not installed
+    """
+    # Nothing here reports to anybody unless the user asks for it
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if "ray" not in sys.modules:
+        # Else Ray takes a process whose parent has ended, as in a container or after `nohup`, for a worker whose raylet has
+        # ended, and when the cluster is gone ends it without a word. Read on import
+        os.environ["RAY_RAYLET_PID"] = str(os.getpid())
+    try:
+        import ray
+    except ImportError as error:
+        raise ImportError('Workers need Ray: pip install "sb3-gae[ray]"') from error
     return ray
