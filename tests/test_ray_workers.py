@@ -206,7 +206,7 @@ print("still here", flush=True)
 
 
 def test_a_process_whose_parent_has_ended_outlives_ray(tmp_path: Path) -> None:
-    """Ray's own rule, by which it would end, is of workers; a container's first process starts trainings that way, and `nohup`."""
+    """Ray's own rule, by which it would end, is of workers; trainings of a container and after `nohup` begin that way."""
     script, output = tmp_path / "script.py", tmp_path / "output.txt"
     script.write_text(_WITHOUT_PARENT)
     output.touch()
