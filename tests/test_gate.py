@@ -110,6 +110,29 @@ def test_a_fault_is_noticed_by_its_own_numbers_and_where_nothing_else_is_red(mon
     assert not prove_with(red, red)
 
 
+def test_a_time_counts_against_the_code_only_where_each_try_is_outside_its_band(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    band, measured = Band(0.0, 1.5), iter([])
+    limits = {"one": band, "other": band}
+    part = Part(lambda: next(measured), lambda before: before, lambda recorded: limits, "ratio", tries=3)
+    monkeypatch.setitem(PARTS, "part", part)
+
+    def measured_of(*rounds: tuple[float, float]) -> dict[str, float]:
+        nonlocal measured
+        measured = iter([{"one": one, "other": other} for one, other in rounds])
+        least = gate.measure("part", limits)
+        assert not list(measured), "fewer tries than are allowed"
+        return least
+
+    assert measured_of((1.0, 1.2)) == {"one": 1.0, "other": 1.2}
+    # What was good is not measured worse by a try for another number
+    assert measured_of((1.0, 2.0), (3.0, 1.4)) == {"one": 1.0, "other": 1.4}
+    assert "again (2 left): other" in capsys.readouterr().out
+    assert measured_of((1.0, 2.0), (1.0, 1.9), (1.0, 2.1)) == {"one": 1.0, "other": 1.9}
+    assert not gate.verdicts({"one": 1.0, "other": 1.9}, limits)["other"]
+
+
 def test_every_fault_has_numbers_that_are_recorded() -> None:
     records = read_records()
     for plant in PLANTS.values():

@@ -9,8 +9,8 @@ Turns red when speed or learning have got worse than what is recorded of unchang
     python -m benchmarks.gate draw                # the history as a figure
 
 A mean of learning scores may be four standard errors off, a ratio of times 15 % above the largest recorded on the same kind
-of processor, and a count of work 5 % above the largest of other seeds. An improvement that leaves a band, or makes one
-wider than need be, is to be recorded anew, on purpose.
+of processor in each of three measurements, and a count of work 5 % above the largest of other seeds. An improvement that
+leaves a band, or makes one wider than need be, is to be recorded anew, on purpose.
 """
 
 import argparse
@@ -43,7 +43,8 @@ def red_numbers(part: str, keep: bool = False, quiet: bool = False) -> set[str]:
     :param quiet: whether to print what is outside its band alone
     :return: names of the numbers that are outside their bands
     """
-    measured, limits = PARTS[part].measure(), PARTS[part].bands(read_records()[part])
+    limits = PARTS[part].bands(read_records()[part])
+    measured = measure(part, limits)
     holds = verdicts(measured, limits)
     for name, value in measured.items():
         if not (quiet and holds[name]):
@@ -51,6 +52,23 @@ def red_numbers(part: str, keep: bool = False, quiet: bool = False) -> set[str]:
     if keep:
         remember(part, measured, limits)
     return {name for name, good in holds.items() if not good}
+
+
+def measure(part: str, limits: dict[str, Band]) -> dict[str, float]:
+    """
+    :param part: of the gate
+    :param limits: by name
+    :return: by name; where a number was outside its band, the least of as many tries as its part allows
+    """
+    measured = PARTS[part].measure()
+    for left in range(PARTS[part].tries - 1, 0, -1):
+        red = [name for name, good in verdicts(measured, limits).items() if not good]
+        if not red:
+            break
+        print(f"again ({left} left): {', '.join(red)}", flush=True)
+        again = PARTS[part].measure()
+        measured |= {name: min(measured[name], again[name]) for name in red}
+    return measured
 
 
 def line(part: str, name: str, value: float, band: Band) -> str:
