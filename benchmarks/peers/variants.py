@@ -273,6 +273,11 @@ HUMANOID_CANDIDATES = {
             "KL 0.06, damping of the policy step 10, of the value fit 3",
             {"target_kl": 0.06, "cg_damping": 10.0, "vf_cg_damping": 3.0},
         ),
+        (
+            "kl-.06-policy-damping-30",
+            "KL 0.06, damping of the policy step 30, of the value fit 3",
+            {"target_kl": 0.06, "cg_damping": 30.0, "vf_cg_damping": 3.0},
+        ),
     )
 }
 
