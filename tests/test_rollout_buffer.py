@@ -2,7 +2,6 @@
 
 import copy
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -10,10 +9,7 @@ from gymnasium import spaces
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles import Rollout, advantage_magnitudes, assert_equal_to_rounding, direct_advantages, rollouts
-from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import DictRolloutBuffer, RolloutBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_gae import GAEDictRolloutBuffer, GAERolloutBuffer
 
@@ -345,94 +341,3 @@ def test_dict_buffer_has_the_same_advantages_as_its_twin() -> None:
     assert np.array_equal(twin.advantage_grid([0.5, 1.0], [0.3]), plain.advantage_grid([0.5, 1.0], [0.3]))
     for column, expected in zip(twin.lambda_sweep([0.5]), plain.lambda_sweep([0.5]), strict=True):
         assert np.array_equal(column, expected)
-
-
-# --- Floats for spaces of integers ---
-
-WHOLE = spaces.Box(0, 255, (2,), np.uint8)
-FRACTIONS = np.float32([[-1.5, 0.46], [1.26, 1.53]])
-
-
-def add_whole_and_fractional_step(buffer: GAERolloutBuffer, key: str | None = None) -> None:
-    no = np.zeros(2, dtype=bool)
-    for observations in (FRACTIONS.astype(np.uint8), FRACTIONS):
-        buffer.add_step(observations if key is None else {key: observations}, FRACTIONS, np.zeros(2), no, no, no)
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.int64])
-def test_floats_that_come_for_a_space_of_integers_are_kept(dtype: type) -> None:
-    """Such are the vectors that VecNormalize makes of integers, and the actions that a Gaussian policy draws for them."""
-    space = spaces.Box(0, 255, (2,), dtype)
-    buffer = GAERolloutBuffer(2, space, space, n_envs=2, device="cpu")
-    for _ in range(2):
-        add_whole_and_fractional_step(buffer)
-        np.testing.assert_array_equal(buffer.observations, [FRACTIONS.astype(np.uint8), FRACTIONS])
-        np.testing.assert_array_equal(buffer.actions, [FRACTIONS, FRACTIONS])
-        assert buffer.observations.dtype == buffer.actions.dtype == np.float32
-        buffer.reset()
-
-
-def test_floats_that_come_for_integers_in_a_dict_are_kept() -> None:
-    buffer = GAEDictRolloutBuffer(2, spaces.Dict({"ram": WHOLE}), WHOLE, n_envs=2, device="cpu")
-    add_whole_and_fractional_step(buffer, "ram")
-    np.testing.assert_array_equal(buffer.observations["ram"], [FRACTIONS.astype(np.uint8), FRACTIONS])
-
-
-def test_integers_stay_as_small_as_their_space_has_them() -> None:
-    buffer = GAERolloutBuffer(2, WHOLE, spaces.MultiBinary(2), n_envs=2, device="cpu")
-    no = np.zeros(2, dtype=bool)
-    buffer.add_step(np.full((2, 2), 200, dtype=np.uint8), np.ones((2, 2), dtype=np.float32), np.zeros(2), no, no, no)
-    assert (buffer.observations.dtype, buffer.actions.dtype) == (np.uint8, np.int8)
-
-
-# --- In SB3's own PPO ---
-
-
-class KeepRollouts(BaseCallback):
-    """Copies of what each rollout was made into."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.advantages: list[np.ndarray] = []
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        self.advantages.append(self.locals["rollout_buffer"].advantages.copy())
-
-
-def run_ppo(buffer_class: type[RolloutBuffer], n_envs: int) -> tuple[PPO, KeepRollouts]:
-    # So short a limit that there are truncations as well as terminations
-    env = make_vec_env(lambda: gym.make("CartPole-v1", max_episode_steps=12), n_envs, seed=0)
-    keep = KeepRollouts()
-    model = PPO(
-        "MlpPolicy",
-        env,
-        n_steps=48,
-        batch_size=24,
-        n_epochs=2,
-        seed=0,
-        device="cpu",
-        policy_kwargs={"net_arch": [8]},
-        rollout_buffer_class=buffer_class,
-    )
-    return model.learn(48 * n_envs * 4, callback=keep), keep
-
-
-def test_ppo_of_sb3_learns_bit_for_bit_the_same_with_this_buffer() -> None:
-    (ours, kept), (theirs, kept_by_sb3) = (run_ppo(each, n_envs=1) for each in (GAERolloutBuffer, RolloutBuffer))
-    assert len(kept.advantages) == len(kept_by_sb3.advantages) == 4
-    for our_advantages, their_advantages in zip(kept.advantages, kept_by_sb3.advantages, strict=True):
-        assert np.array_equal(our_advantages, their_advantages)
-    for name, parameter in theirs.policy.state_dict().items():
-        assert th.equal(ours.policy.state_dict()[name], parameter), name
-
-
-def test_ppo_of_sb3_gets_the_same_first_rollout_from_several_environments() -> None:
-    # After it the two differ by the order of minibatches: SB3 flattens environments first, this buffer time
-    (ours, kept), (_, kept_by_sb3) = (run_ppo(each, n_envs=3) for each in (GAERolloutBuffer, RolloutBuffer))
-    assert np.array_equal(kept.advantages[0], kept_by_sb3.advantages[0])
-    assert len(kept.advantages) == 4
-    assert ours.rollout_buffer.dones.any()
-    assert all(th.isfinite(parameter).all() for parameter in ours.policy.parameters())
