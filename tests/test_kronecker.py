@@ -68,6 +68,24 @@ def test_several_blocks_give_the_factors_of_one(monkeypatch: pytest.MonkeyPatch)
             th.testing.assert_close(factor, factor_in_pieces)
 
 
+def test_with_a_former_one_of_the_network_it_is_what_it_is_without() -> None:
+    network = network_of([8, 6, 1], inputs_of(60, 8))
+    former = KroneckerPreconditioner(network, ones(network))
+    with th.no_grad():
+        for parameter in network.parameters:
+            parameter.mul_(1.5)
+    network.forward()
+    alone = network_of([8, 6, 1], inputs_of(60, 8))
+    with th.no_grad():
+        for parameter, scaled in zip(alone.parameters, network.parameters, strict=True):
+            parameter.copy_(scaled)
+    alone.forward()
+    vector = th.randn(network.n_parameters, dtype=th.double)
+    expected = KroneckerPreconditioner(alone, ones(alone))(vector, 3.0, 0.01)
+    assert th.equal(KroneckerPreconditioner(network, ones(network), former=former)(vector, 3.0, 0.01), expected)
+    assert not th.equal(former(vector, 3.0, 0.01), expected)
+
+
 def test_is_symmetric_and_positive_definite() -> None:
     network = network_of([4, 6, 1], inputs_of(60, 4))
     precondition = KroneckerPreconditioner(network, ones(network))

@@ -53,6 +53,10 @@ def counted(computation: Callable[[], object]) -> int:
 
 @pytest.fixture
 def network() -> DenseNetwork:
+    return network_of_layers()
+
+
+def network_of_layers() -> DenseNetwork:
     modules: list[th.nn.Module] = []
     for layer in LAYERS:
         modules += [th.nn.Linear(*layer), th.nn.Tanh()]
@@ -72,10 +76,15 @@ def test_passes_of_a_network_are_what_torch_counts(network: DenseNetwork) -> Non
         ops.operations(ops.forward(LAYERS, BATCH)): network.forward,
         ops.operations(ops.backward(LAYERS, BATCH)): lambda: network.vjp(outputs),
         ops.operations(ops.curvature_product(LAYERS, BATCH)): lambda: network.gauss_newton_product(vector, lambda x, _: x),
-        ops.operations(ops.kronecker_factors(LAYERS, BATCH)): lambda: network.kronecker_factors(outputs),
     }
     assert {expected: counted(computation) for expected, computation in passes.items()} == {each: each for each in passes}
     assert network.n_parameters == ops.n_parameters(LAYERS)
+
+
+def test_second_moments_of_the_inputs_are_computed_once() -> None:
+    fresh = network_of_layers()
+    counts = [counted(lambda: fresh.kronecker_factors(th.ones(BATCH, N_ACTIONS))) for _ in range(2)]
+    assert counts == [ops.operations(ops.kronecker_factors(LAYERS, BATCH, again)) for again in (False, True)]
 
 
 def test_double_backward_is_what_torch_counts(network: DenseNetwork) -> None:

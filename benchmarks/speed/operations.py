@@ -28,7 +28,8 @@ An MLP has layers :math:`h_l = f(W_l (h_{l-1}, 1))`, the bias the last column of
 A policy step on B samples with the curvature on C of them is a forward and a backward pass over B, a forward pass and
 the Kronecker factors over C, a curvature product over C and an application of the factors for each step of conjugate gradient,
 and a forward pass over B for each trial of the line search. A value step is the same less the first forward pass, which is
-the last trial of the step before. Its curvature needs no forward pass of its own where C is B.
+the last trial of the step before. Its curvature needs no forward pass of its own where C is B, and the second moments of
+the inputs of the first layer are those of the first step.
 """
 
 import itertools
@@ -180,14 +181,15 @@ def _gradients_alone(layers: Iterable[Layer], batch: int) -> Products:
     return Counter(Product(n_out, batch, n_in) for n_in, n_out in layers)
 
 
-def kronecker_factors(layers: Sequence[Layer], batch: int) -> Products:
+def kronecker_factors(layers: Sequence[Layer], batch: int, again: bool = False) -> Products:
     """
     :param layers: of an MLP
     :param batch: rows
+    :param again: whether those of the inputs of the first are known from a former call
     :return: of the second moments at each layer
     """
-    moments = [Product(width, batch, width) for layer in layers for width in (layer.n_in + 1, layer.n_out)]
-    return cotangents(layers, batch) + Counter(moments)
+    widths = [width for layer in layers for width in (layer.n_in + 1, layer.n_out)]
+    return cotangents(layers, batch) + Counter(Product(width, batch, width) for width in widths[again:])
 
 
 def kronecker_solve(layers: Sequence[Layer]) -> Products:
@@ -253,8 +255,8 @@ def value_fit(layers: Sequence[Layer], batch: int, curvature_batch: int, steps: 
     :return: of the fit
     """
     products = forward(layers, batch)
-    for what in steps:
-        products += backward(layers, batch) + kronecker_factors(layers, curvature_batch)
+    for step, what in enumerate(steps):
+        products += backward(layers, batch) + kronecker_factors(layers, curvature_batch, again=step > 0)
         products += conjugate_gradient(layers, curvature_batch, what) + times(forward(layers, batch), what.trials)
         if curvature_batch != batch:
             products += forward(layers, curvature_batch)

@@ -10,6 +10,7 @@ biases are beside its weights (:mod:`~sb3_gae.networks.joined_layers`). Adding a
 the second moments are then part of a matrix product, instead of a pass over memory each; and all but the ones is contiguous.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Sequence
 
 import torch as th
@@ -135,13 +136,24 @@ class DenseNetwork:
         :return: for each layer the mean outer product of its inputs, with a 1 appended for the bias, and that of the
             cotangents at its output: shapes (n_in + 1, n_in + 1) and (n_out, n_out)
         """
-        factors: dict[int, tuple[th.Tensor, th.Tensor]] = {}
+        of_inputs: dict[int, th.Tensor] = {0: self._input_moments}
+        of_outputs: dict[int, th.Tensor] = {}
         for index, block in enumerate(cotangents.split(_BLOCK_ROWS)):
             for layer, hidden, at_layer in self._backward(index, block):
-                moments = hidden @ hidden.t() / self.batch_size, at_layer @ at_layer.t() / self.batch_size
-                before = factors.get(layer, (0.0, 0.0))
-                factors[layer] = (before[0] + moments[0], before[1] + moments[1])
-        return [factors[layer] for layer in range(len(self.layers))]
+                of_outputs[layer] = of_outputs.get(layer, 0.0) + self._moments(at_layer)
+                if layer > 0:
+                    of_inputs[layer] = of_inputs.get(layer, 0.0) + self._moments(hidden)
+        return [(of_inputs[layer], of_outputs[layer]) for layer in range(len(self.layers))]
+
+    @functools.cached_property
+    def _input_moments(self) -> th.Tensor:
+        """Of the first layer: the same for all parameters, and where there are many inputs the most work of all factors."""
+        total, *others = (self._moments(hidden[0]) for hidden in self._hidden)
+        return sum(others, start=total)
+
+    def _moments(self, rows: th.Tensor) -> th.Tensor:
+        """What a block adds to the mean of the outer products of its columns."""
+        return rows @ rows.t() / self.batch_size
 
     def _jvp_block(self, index: int, tangents: list[th.Tensor]) -> th.Tensor:
         """How the outputs of a block move along a direction in parameter space, shape (n_out, B)."""

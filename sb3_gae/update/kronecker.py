@@ -18,6 +18,9 @@ from sb3_gae.networks.joined_layers import joined_pieces, separated
 #: second moments of cotangents at the outputs of linear layers, shapes (n_out, n_out)
 OutputMoments = Mapping[nn.Module, th.Tensor]
 
+# Eigenvalues of a second moment, shape (n,), and its eigenvectors as columns, shape (n, n)
+_Eigen = tuple[th.Tensor, th.Tensor]
+
 NOTHING_ADDED: OutputMoments = MappingProxyType({})
 
 # Eigendecompositions grow with the cube of a layer's width; above this they cost more than the products that they save
@@ -32,13 +35,23 @@ class KroneckerPreconditioner:
     :param cotangents: one for each output, whose covariance is the output metric, shape (B, n_out)
     :param added: second moments of further cotangents at the outputs of some layers, where the curvature of another
         network with these layers is added: both have the same inputs, so that the sum is a Kronecker product again
+    :param former: of the same network with other parameters. The inputs of the first layer are the same for all, and so is
+        the eigendecomposition of their moments
     """
 
-    def __init__(self, network: DenseNetwork, cotangents: th.Tensor, added: OutputMoments = NOTHING_ADDED):
+    def __init__(
+        self,
+        network: DenseNetwork,
+        cotangents: th.Tensor,
+        added: OutputMoments = NOTHING_ADDED,
+        former: "KroneckerPreconditioner | None" = None,
+    ):
         self._layers = [linear for linear, _ in network.layers]
-        self._eigen = [
-            (_eigh(inputs), _eigh(outputs + added[layer] if layer in added else outputs))
-            for layer, (inputs, outputs) in zip(self._layers, network.kronecker_factors(cotangents), strict=True)
+        factors = network.kronecker_factors(cotangents)
+        first = _eigh(factors[0][0]) if former is None else former._eigen[0][0]
+        self._eigen: list[tuple[_Eigen, _Eigen]] = [
+            (_eigh(inputs) if index else first, _eigh(outputs + added[layer] if layer in added else outputs))
+            for index, (layer, (inputs, outputs)) in enumerate(zip(self._layers, factors, strict=True))
         ]
 
     @staticmethod
@@ -69,7 +82,7 @@ class KroneckerPreconditioner:
         return separated(self._layers, solved)
 
 
-def _eigh(matrix: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+def _eigh(matrix: th.Tensor) -> _Eigen:
     values, vectors = th.linalg.eigh(matrix)
     # Rounding may leave a semi-definite matrix with eigenvalues just below zero
     return values.clamp_min(0.0), vectors

@@ -180,6 +180,7 @@ class _DenseValues:
         if curvature_observations is not observations:
             self._curvature_network = dense_value_network(policy, curvature_observations, parameters)
         self.parameters: Sequence[th.Tensor] = self._network.parameters
+        self._preconditioner: KroneckerPreconditioner | None = None
 
     def values(self) -> th.Tensor:
         return self._network.forward().squeeze(1)
@@ -197,7 +198,9 @@ class _DenseValues:
 
         if added is None or not KroneckerPreconditioner.suits(network):
             return product, None
-        return product, KroneckerPreconditioner(network, self.parameters[0].new_ones(network.batch_size, 1), added)
+        ones = self.parameters[0].new_ones(network.batch_size, 1)
+        self._preconditioner = KroneckerPreconditioner(network, ones, added, former=self._preconditioner)
+        return product, self._preconditioner
 
 
 class _AutogradValues:
