@@ -244,6 +244,7 @@ DAMPING_CANDIDATES = {
 }
 
 _HUMANOID = _MANY_JOINTS | {"cg_damping": 0.1, "vf_cg_damping": "auto"}
+_HUMANOID_DAMPED = {"cg_damping": 30.0, "vf_cg_damping": 3.0}
 
 #: settings that were tried on Humanoid-v5, where few agents walk within a million steps
 HUMANOID_CANDIDATES = {
@@ -277,6 +278,13 @@ HUMANOID_CANDIDATES = {
             "kl-.06-policy-damping-30",
             "KL 0.06, damping of the policy step 30, of the value fit 3",
             {"target_kl": 0.06, "cg_damping": 30.0, "vf_cg_damping": 3.0},
+        ),
+        ("lambda-.7", "λ 0.7, KL 0.03, dampings 30 and 3", _HUMANOID_DAMPED | {"gae_lambda": 0.7}),
+        ("lambda-.5", "λ 0.5, KL 0.03, dampings 30 and 3", _HUMANOID_DAMPED | {"gae_lambda": 0.5}),
+        (
+            "lambda-.7-value-lambda-.9",
+            "λ 0.7 and 0.9 of the value targets, KL 0.03, dampings 30 and 3",
+            _HUMANOID_DAMPED | {"gae_lambda": 0.7, "value_lambda": 0.9},
         ),
     )
 }
