@@ -280,11 +280,15 @@ HUMANOID_CANDIDATES = {
             {"target_kl": 0.06, "cg_damping": 30.0, "vf_cg_damping": 3.0},
         ),
         ("lambda-.7", "λ 0.7, KL 0.03, dampings 30 and 3", _HUMANOID_DAMPED | {"gae_lambda": 0.7}),
-        ("lambda-.5", "λ 0.5, KL 0.03, dampings 30 and 3", _HUMANOID_DAMPED | {"gae_lambda": 0.5}),
         (
             "lambda-.7-value-lambda-.9",
             "λ 0.7 and 0.9 of the value targets, KL 0.03, dampings 30 and 3",
             _HUMANOID_DAMPED | {"gae_lambda": 0.7, "value_lambda": 0.9},
+        ),
+        (
+            "value-lambda-.97",
+            "λ 0.9 and 0.97 of the value targets, KL 0.03, dampings 30 and 3",
+            _HUMANOID_DAMPED | {"value_lambda": 0.97},
         ),
     )
 }
