@@ -59,7 +59,10 @@ def test_recording_speed_keeps_what_was_recorded_of_other_processors(monkeypatch
     monkeypatch.setattr(gate_parts, "processor", lambda: "one")
     monkeypatch.setattr(gate_parts, "speed_ratios", lambda: {"ratio": 0.5})
     before = {"one": {"ratio": [9.0]}, "other": {"ratio": [4.0]}}
-    assert record_speed(before) == {"one": {"ratio": [0.5] * gate_parts.RECORDED_ROUNDS}, "other": {"ratio": [4.0]}}
+    new = [0.5] * gate_parts.RECORDED_ROUNDS
+    assert record_speed(before) == {"one": {"ratio": [9.0, *new]}, "other": {"ratio": [4.0]}}
+    monkeypatch.setattr(gate_parts, "KEPT_ROUNDS", gate_parts.RECORDED_ROUNDS)
+    assert record_speed(before) == {"one": {"ratio": new}, "other": {"ratio": [4.0]}}
     assert record_speed(None) == {"one": {"ratio": [0.5] * gate_parts.RECORDED_ROUNDS}}
 
 

@@ -15,6 +15,8 @@ from benchmarks.peers.provenance import processor
 RECORDED_SEEDS = range(100, 120)
 #: of what is recorded run by run
 RECORDED_ROUNDS = 10
+#: how many of these are kept. Ratios differ more between days, on the same kind of processor, than within one recording
+KEPT_ROUNDS = 30
 
 
 class Part(NamedTuple):
@@ -45,9 +47,12 @@ def work_bands(recorded: dict[str, dict[str, float]]) -> dict[str, Band]:
 
 
 def record_speed(before: dict[str, dict[str, list[float]]] | None) -> dict[str, dict[str, list[float]]]:
-    """:return: ratios by processor, name and run; those of other processors as before"""
+    """:return: ratios by processor, name and run: after the last ones of this processor, those of others as before"""
+    before = before or {}
+    former = before.get(processor(), {})
     runs = _by_name({run: speed_ratios() for run in range(RECORDED_ROUNDS)})
-    return (before or {}) | {processor(): {name: list(ratios.values()) for name, ratios in runs.items()}}
+    own = {name: [*former.get(name, []), *ratios.values()][-KEPT_ROUNDS:] for name, ratios in runs.items()}
+    return before | {processor(): own}
 
 
 def speed_bands(recorded: dict[str, dict[str, list[float]]]) -> dict[str, Band]:
