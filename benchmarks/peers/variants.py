@@ -262,7 +262,7 @@ HUMANOID_CANDIDATES = {
         (
             "policy-damping-30",
             "KL 0.03, damping of the policy step 30, of the value fit 3",
-            {"cg_damping": 30.0, "vf_cg_damping": 3.0},
+            _HUMANOID_DAMPED,
         ),
         (
             "policy-damping-100",
@@ -277,7 +277,7 @@ HUMANOID_CANDIDATES = {
         (
             "kl-.06-policy-damping-30",
             "KL 0.06, damping of the policy step 30, of the value fit 3",
-            {"target_kl": 0.06, "cg_damping": 30.0, "vf_cg_damping": 3.0},
+            _HUMANOID_DAMPED | {"target_kl": 0.06},
         ),
         ("lambda-.7", "λ 0.7, KL 0.03, dampings 30 and 3", _HUMANOID_DAMPED | {"gae_lambda": 0.7}),
         (
