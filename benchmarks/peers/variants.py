@@ -290,6 +290,16 @@ HUMANOID_CANDIDATES = {
             "λ 0.9 and 0.97 of the value targets, KL 0.03, dampings 30 and 3",
             _HUMANOID_DAMPED | {"value_lambda": 0.97},
         ),
+        (
+            "batch-1024",
+            "batches of 1 024 steps, KL 0.03, dampings 30 and 3",
+            _HUMANOID_DAMPED | {"n_steps": 128},
+        ),
+        (
+            "batch-1024-kl-.015",
+            "batches of 1 024 steps, KL 0.015, dampings 30 and 3",
+            _HUMANOID_DAMPED | {"n_steps": 128, "target_kl": 0.015},
+        ),
     )
 }
 
