@@ -15,11 +15,11 @@ import benchmarks.gate.__main__ as gate
 import benchmarks.gate.parts as gate_parts
 from benchmarks.gate.bands import LEARNING_DEVIATIONS, Band, cost_band, learning_band, verdicts
 from benchmarks.gate.learning import RUNS, SEEDS
-from benchmarks.gate.parts import PARTS, Part, record_speed, speed_bands
+from benchmarks.gate.parts import PARTS, Part, record_speed
 from benchmarks.gate.plants import PLANTS, Plant, twice
 from benchmarks.gate.records import read_records
 from benchmarks.gate.speed import ROLLOUT_TASKS
-from benchmarks.gate.work import COUNTS, SEED, counted
+from benchmarks.gate.work import COUNTS, SEED, calls, counted
 
 
 def test_a_band_for_learning_reaches_as_far_as_the_error_of_two_means() -> None:
@@ -47,29 +47,36 @@ def test_a_band_for_a_cost_has_no_lower_end() -> None:
     assert not band.holds(math.nan)
 
 
-def test_speed_is_judged_by_what_is_recorded_of_its_kind_of_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    recorded = {"one": {"ratio": [1.0, 2.0]}, "other": {"ratio": [4.0, 3.0], "new": [1.0]}}
-    monkeypatch.setattr(gate_parts, "processor", lambda: "one")
-    assert speed_bands(recorded) == {"ratio": Band(0.0, pytest.approx(2.3))}
-    monkeypatch.setattr(gate_parts, "processor", lambda: "a third")
-    assert speed_bands(recorded) == {"ratio": Band(0.0, 6.0), "new": Band(0.0, 1.5)}
-
-
-def test_recording_speed_keeps_what_was_recorded_of_other_processors(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gate_parts, "processor", lambda: "one")
-    monkeypatch.setattr(gate_parts, "speed_ratios", lambda: {"ratio": 0.5})
-    before = {"one": {"ratio": [9.0]}, "other": {"ratio": [4.0]}}
-    new = [0.5] * gate_parts.RECORDED_ROUNDS
-    assert record_speed(before) == {"one": {"ratio": [9.0, *new]}, "other": {"ratio": [4.0]}}
+def test_recording_speed_keeps_the_last_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate_parts, "speed_ratios", lambda: {"ratio": 0.5, "new": 2.0})
+    new = {"ratio": [0.5] * gate_parts.RECORDED_ROUNDS, "new": [2.0] * gate_parts.RECORDED_ROUNDS}
+    assert record_speed(None) == new
+    # What is no longer measured goes
+    assert record_speed({"ratio": [9.0], "old": [1.0]}) == new | {"ratio": [9.0, *new["ratio"]]}
     monkeypatch.setattr(gate_parts, "KEPT_ROUNDS", gate_parts.RECORDED_ROUNDS)
-    assert record_speed(before) == {"one": {"ratio": new}, "other": {"ratio": [4.0]}}
-    assert record_speed(None) == {"one": {"ratio": [0.5] * gate_parts.RECORDED_ROUNDS}}
+    assert record_speed({"ratio": [9.0]}) == new
 
 
 def test_arithmetic_of_products_and_calls_of_operators_are_counted() -> None:
     first, second = th.ones(3, 4), th.ones(4, 5)
     assert counted(lambda: th.tanh(first @ second)) == (2 * 3 * 4 * 5, 2)
     assert counted(lambda: None) == (0, 0)
+
+
+def test_calls_of_functions_are_counted_and_the_former_profile_is_put_back() -> None:
+    former = sys.getprofile()
+
+    def own() -> None:
+        [len(()), abs(1)]
+
+    def fails() -> None:
+        raise KeyError
+
+    assert calls(own) == 3
+    assert calls(lambda: [own(), own()]) == 7
+    with pytest.raises(KeyError):
+        calls(fails)
+    assert sys.getprofile() is former
 
 
 @pytest.mark.parametrize(
@@ -154,8 +161,7 @@ def test_the_records_cover_what_is_measured_with_seeds_of_their_own() -> None:
     for name, scores in (records["learning"] | records["work"]).items():
         assert len(scores) >= 20, name
         assert not {int(seed) for seed in scores} & {*SEEDS, SEED}, name
-    for ratios in records["speed"].values():
-        assert {f"rollout / steps, {task}" for task in ROLLOUT_TASKS} < set(ratios)
-        assert all(len(runs) >= 10 for runs in ratios.values())
+    assert {f"rollout / steps, {task}" for task in ROLLOUT_TASKS} < set(records["speed"])
+    assert all(len(runs) >= 10 for runs in records["speed"].values())
     for name, part in PARTS.items():
         assert all(band.low < band.high for band in part.bands(records[name]).values())

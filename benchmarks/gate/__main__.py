@@ -8,9 +8,9 @@ Turns red when speed or learning have got worse than what is recorded of unchang
     python -m benchmarks.gate repeat --times 20   # how often unchanged code is red
     python -m benchmarks.gate draw                # the history as a figure
 
-A mean of learning scores may be four standard errors off, a ratio of times 15 % above the largest recorded on the same kind
-of processor in each of three measurements, and a count of work 5 % above the largest of other seeds. An improvement that
-leaves a band, or makes one wider than need be, is to be recorded anew, on purpose.
+A mean of learning scores may be four standard errors off, a ratio of times half above the largest recorded in each of three
+measurements, and a count of work 5 % above the largest of other seeds. An improvement that leaves a band, or makes one wider
+than need be, is to be recorded anew, on purpose.
 """
 
 import argparse

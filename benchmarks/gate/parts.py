@@ -5,17 +5,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.gate.bands import OTHER_SPEED_MARGIN, SPEED_MARGIN, WORK_MARGIN, Band, cost_band, learning_band
+from benchmarks.gate.bands import SPEED_MARGIN, WORK_MARGIN, Band, cost_band, learning_band
 from benchmarks.gate.learning import RUNS, SEEDS, learning_scores
 from benchmarks.gate.speed import speed_ratios
 from benchmarks.gate.work import work_counts
-from benchmarks.peers.provenance import processor
 
 #: of what is recorded by seed; the gate itself uses others
 RECORDED_SEEDS = range(100, 120)
 #: of what is recorded run by run
 RECORDED_ROUNDS = 10
-#: how many of these are kept. Ratios differ more between days, on the same kind of processor, than within one recording
+#: how many of these are kept. Ratios differ more between days than within one recording
 KEPT_ROUNDS = 30
 
 
@@ -46,24 +45,16 @@ def work_bands(recorded: dict[str, dict[str, float]]) -> dict[str, Band]:
     return {name: cost_band(list(counts.values()), WORK_MARGIN) for name, counts in recorded.items()}
 
 
-def record_speed(before: dict[str, dict[str, list[float]]] | None) -> dict[str, dict[str, list[float]]]:
-    """:return: ratios by processor, name and run: after the last ones of this processor, those of others as before"""
-    before = before or {}
-    former = before.get(processor(), {})
+def record_speed(before: dict[str, list[float]] | None) -> dict[str, list[float]]:
+    """:return: ratios by name and run, after the last ones of before"""
+    former = before or {}
     runs = _by_name({run: speed_ratios() for run in range(RECORDED_ROUNDS)})
-    own = {name: [*former.get(name, []), *ratios.values()][-KEPT_ROUNDS:] for name, ratios in runs.items()}
-    return before | {processor(): own}
+    return {name: [*former.get(name, []), *ratios.values()][-KEPT_ROUNDS:] for name, ratios in runs.items()}
 
 
-def speed_bands(recorded: dict[str, dict[str, list[float]]]) -> dict[str, Band]:
-    """:return: by name, from what is recorded of this kind of processor; if nothing is, wider ones from all others"""
-    if own := recorded.get(processor()):
-        return {name: cost_band(ratios, SPEED_MARGIN) for name, ratios in own.items()}
-    names = {name for of in recorded.values() for name in of}
-    return {
-        name: cost_band([ratio for of in recorded.values() for ratio in of.get(name, [])], OTHER_SPEED_MARGIN)
-        for name in names
-    }
+def speed_bands(recorded: dict[str, list[float]]) -> dict[str, Band]:
+    """:return: by name"""
+    return {name: cost_band(ratios, SPEED_MARGIN) for name, ratios in recorded.items()}
 
 
 def measure_learning() -> dict[str, float]:

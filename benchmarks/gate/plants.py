@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from unittest import mock
 
 from benchmarks.gate.learning import RUNS
-from benchmarks.gate.work import COUNTS
+from benchmarks.gate.work import ROLLOUT_COUNTS, UPDATE_COUNTS
 from sb3_gae import TRPOGAE, GAERolloutBuffer
 from sb3_gae.rollout.collection import ActionSampler
 from sb3_gae.update import trust_region
@@ -28,6 +28,11 @@ def twice(function: Callable[..., Any]) -> Callable[..., Any]:
 def doubled_conjugate_gradient() -> AbstractContextManager[Any]:
     """Every linear system is solved twice."""
     return mock.patch.object(trust_region, "conjugate_gradient", twice(trust_region.conjugate_gradient))
+
+
+def doubled_update() -> AbstractContextManager[Any]:
+    """Policy step and value fit are done twice."""
+    return mock.patch.multiple(TRPOGAE, _step_policy=twice(TRPOGAE._step_policy), _fit_value=twice(TRPOGAE._fit_value))
 
 
 def doubled_actions() -> AbstractContextManager[Any]:
@@ -71,9 +76,10 @@ class Plant(NamedTuple):
 
 #: by name
 PLANTS = {
-    "doubled-cg": Plant(doubled_conjugate_gradient, "work", COUNTS),
-    "doubled-cg-timed": Plant(doubled_conjugate_gradient, "speed", ("update / sb3-contrib's", "value fit / passes")),
-    "doubled-actions": Plant(doubled_actions, "speed", ("actions / policy's own",)),
+    "doubled-cg": Plant(doubled_conjugate_gradient, "work", UPDATE_COUNTS),
+    "doubled-update": Plant(doubled_update, "speed", ("update / sb3-contrib's", "value fit / passes")),
+    "doubled-actions": Plant(doubled_actions, "work", ROLLOUT_COUNTS),
+    "doubled-actions-timed": Plant(doubled_actions, "speed", ("actions / policy's own",)),
     "wrong-sign": Plant(wrong_sign, "learning", tuple(RUNS)),
     "value-first": Plant(value_first, "learning", ("HalfCheetah-v5, close fit",)),
 }

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.update_speed import Update, ours, theirs
 from sb3_gae import TRPOGAE
@@ -69,18 +70,28 @@ def rollout_ratio(task: str) -> float:
     :param task: id
     :return: a rollout over stepping the same environments with given actions
     """
-    env = make_vec_env(task, N_ENVS, seed=0, vec_env_cls=batched_vec_env, vec_env_kwargs={"n_threads": 1})
-    model = TRPOGAE("MlpPolicy", env, n_steps=N_STEPS, seed=0, device="cpu")
-    _, callback = model._setup_learn(N_ENVS * N_STEPS)
-    callback.on_training_start(locals(), globals())
+    collect, env = rollout(task)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (N_STEPS, N_ENVS, *env.action_space.shape)).astype(np.float32)
     times = least_seconds(
         {
-            "rollout": (lambda: model.collect_rollouts(model.env, callback, model.rollout_buffer, N_STEPS), None),
+            "rollout": (collect, None),
             "steps": (lambda: [env.step(action) for action in actions], None),
         }
     )
     return times["rollout"] / times["steps"]
+
+
+def rollout(task: str, seed: int = 0) -> tuple[Callable[[], bool], VecEnv]:
+    """
+    :param task: id
+    :param seed: of environments and policy
+    :return: collects a batch of a new agent, and the environments that it steps
+    """
+    env = make_vec_env(task, N_ENVS, seed=seed, vec_env_cls=batched_vec_env, vec_env_kwargs={"n_threads": 1})
+    model = TRPOGAE("MlpPolicy", env, n_steps=N_STEPS, seed=seed, device="cpu")
+    _, callback = model._setup_learn(N_ENVS * N_STEPS)
+    callback.on_training_start(locals(), globals())
+    return lambda: model.collect_rollouts(model.env, callback, model.rollout_buffer, N_STEPS), env
 
 
 def actions_ratio() -> float:

@@ -1,13 +1,15 @@
-"""The work of an update as counts, which are the same however fast or busy the machine is."""
+"""The work of an update and of a rollout as counts, which are the same however fast or busy the machine is."""
 
+import sys
 from collections.abc import Callable
+from types import FrameType
 from typing import Any
 
 import torch as th
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.gate.speed import BATCH, forward_and_backward
+from benchmarks.gate.speed import BATCH, N_STEPS, ROLLOUT_TASKS, forward_and_backward, rollout
 from benchmarks.update_speed import ours
 from sb3_gae.rollout.evaluation import training_batch
 
@@ -15,12 +17,15 @@ from sb3_gae.rollout.evaluation import training_batch
 SEED = 0
 #: of each of these: additions and multiplications of its matrix products, over those of a forward and a backward pass of
 #: both networks, and the operators that it calls
-COUNTS = (
+UPDATE_COUNTS = (
     "arithmetic of policy step / passes",
     "operators of policy step",
     "arithmetic of value fit / passes",
     "operators of value fit",
 )
+#: functions that a step of all environments calls, Python's and C's. What the environments do in them is not in it
+ROLLOUT_COUNTS = tuple(f"calls of a rollout's step, {task}" for task in ROLLOUT_TASKS)
+COUNTS = (*UPDATE_COUNTS, *ROLLOUT_COUNTS)
 
 
 class OperatorCounter(TorchDispatchMode):
@@ -45,6 +50,16 @@ def work_counts(seed: int = SEED) -> dict[str, float]:
     :return: by name, one of :data:`COUNTS`
     """
     th.set_num_threads(1)
+    return update_counts(seed) | {
+        name: calls(rollout(task, seed)[0]) / N_STEPS for name, task in zip(ROLLOUT_COUNTS, ROLLOUT_TASKS, strict=True)
+    }
+
+
+def update_counts(seed: int) -> dict[str, float]:
+    """
+    :param seed: of rollout and networks
+    :return: by name, one of :data:`UPDATE_COUNTS`
+    """
     model = ours(BATCH, seed=seed)
     batch = training_batch(model.rollout_buffer, model.action_space)
     parameters = model._parameter_groups(batch)
@@ -52,7 +67,7 @@ def work_counts(seed: int = SEED) -> dict[str, float]:
     policy_step = counted(lambda: model._step_policy(batch, parameters))
     value_fit = counted(lambda: model._fit_value(batch, parameters))
     counts = (policy_step[0] / passes, policy_step[1], value_fit[0] / passes, value_fit[1])
-    return dict(zip(COUNTS, counts, strict=True))
+    return dict(zip(UPDATE_COUNTS, counts, strict=True))
 
 
 def counted(action: Callable[[], object]) -> tuple[int, int]:
@@ -63,3 +78,24 @@ def counted(action: Callable[[], object]) -> tuple[int, int]:
     with OperatorCounter() as operators, FlopCounterMode(display=False) as arithmetic:
         action()
     return arithmetic.get_total_flops(), operators.calls
+
+
+def calls(action: Callable[[], object]) -> int:
+    """
+    :param action: to be done once
+    :return: functions of Python and of C that are called for it, itself among them
+    """
+    count = 0
+
+    def see(_frame: FrameType, event: str, _arg: Any) -> None:
+        nonlocal count
+        count += event in ("call", "c_call")
+
+    before = sys.getprofile()
+    sys.setprofile(see)
+    try:
+        action()
+    finally:
+        sys.setprofile(before)
+    # Putting the former profile back is one
+    return count - 1
