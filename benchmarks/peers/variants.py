@@ -245,6 +245,7 @@ DAMPING_CANDIDATES = {
 
 _HUMANOID = _MANY_JOINTS | {"cg_damping": 0.1, "vf_cg_damping": "auto"}
 _HUMANOID_DAMPED = {"cg_damping": 30.0, "vf_cg_damping": 3.0}
+_STD_LARGER = {"policy_kwargs": "dict(log_std_init=-1)"}
 
 #: settings that were tried on Humanoid-v5, where few agents walk within a million steps
 HUMANOID_CANDIDATES = {
@@ -299,6 +300,12 @@ HUMANOID_CANDIDATES = {
             "batch-1024-kl-.015",
             "batches of 1 024 steps, KL 0.015, dampings 30 and 3",
             _HUMANOID_DAMPED | {"n_steps": 128, "target_kl": 0.015},
+        ),
+        ("std-.37", "initial std e⁻¹, KL 0.03, dampings 30 and 3", _HUMANOID_DAMPED | _STD_LARGER),
+        (
+            "std-.37-policy-damping-5",
+            "initial std e⁻¹, KL 0.03, dampings 5 and 3",
+            _HUMANOID_DAMPED | _STD_LARGER | {"cg_damping": 5.0},
         ),
     )
 }
