@@ -182,6 +182,23 @@ PENDULUM_CANDIDATES = {
             _SDE_1024 | {"vf_cg_damping": 3.0},
         ),
         ("sde-two-envs-1024-lambda-.98", "gSDE, 2 × 512 steps, λ 0.98", _SDE_1024 | {"gae_lambda": 0.98}),
+        (
+            "sde-two-envs-1024-damping-.01",
+            "gSDE, 2 × 512 steps, damping of the policy step 0.01",
+            _SDE_1024 | {"cg_damping": 0.01},
+        ),
+        ("sde-two-envs-1024-gamma-.95", "gSDE, 2 × 512 steps, γ 0.95", _SDE_1024 | {"gamma": 0.95}),
+        ("sde-two-envs-1024-vf-steps-10", "gSDE, 2 × 512 steps, up to ten value steps", _SDE_1024 | {"vf_steps": 10}),
+        (
+            "sde-two-envs-1024-normalized",
+            "gSDE, 2 × 512 steps, normalised observations",
+            _SDE_1024 | {"normalize": "dict(norm_obs=True, norm_reward=False)"},
+        ),
+        (
+            "sde-two-envs-1024-noise-8",
+            "gSDE, a new noise matrix every eight steps, 2 × 512 steps",
+            _SDE_1024 | {"sde_sample_freq": 8},
+        ),
         ("sde-lambda-.9", "gSDE, λ 0.9", _SDE | {"gae_lambda": 0.9}),
         ("sde-lambda-.99", "gSDE, λ 0.99", _SDE | {"gae_lambda": 0.99}),
     )
