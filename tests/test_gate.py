@@ -1,6 +1,7 @@
 """The gate's arithmetic; what it measures is left to `python -m benchmarks.gate`, since tests do not time things."""
 
 import contextlib
+import cProfile
 import math
 import sys
 from pathlib import Path
@@ -15,11 +16,14 @@ import benchmarks.gate.__main__ as gate
 import benchmarks.gate.parts as gate_parts
 from benchmarks.gate.bands import LEARNING_DEVIATIONS, Band, cost_band, learning_band, verdicts
 from benchmarks.gate.learning import RUNS, SEEDS
-from benchmarks.gate.parts import PARTS, Part, record_speed
+from benchmarks.gate.parts import PARTS, Part, record_speed, speed_bands
 from benchmarks.gate.plants import PLANTS, Plant, twice
 from benchmarks.gate.records import read_records
-from benchmarks.gate.speed import ROLLOUT_TASKS
-from benchmarks.gate.work import COUNTS, SEED, calls, counted
+from benchmarks.gate.speed import ROLLOUT_TASKS, Times, speed_ratios
+from benchmarks.gate.work import COUNTS, SEED, CallsByStep, counted
+from sb3_gae import TRPOGAE, GAERolloutBuffer
+from sb3_gae.rollout.collection import ActionSampler
+from sb3_gae.update import trust_region
 
 
 def test_a_band_for_learning_reaches_as_far_as_the_error_of_two_means() -> None:
@@ -47,14 +51,27 @@ def test_a_band_for_a_cost_has_no_lower_end() -> None:
     assert not band.holds(math.nan)
 
 
-def test_recording_speed_keeps_the_last_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gate_parts, "speed_ratios", lambda: {"ratio": 0.5, "new": 2.0})
-    new = {"ratio": [0.5] * gate_parts.RECORDED_ROUNDS, "new": [2.0] * gate_parts.RECORDED_ROUNDS}
-    assert record_speed(None) == new
-    # What is no longer measured goes
-    assert record_speed({"ratio": [9.0], "old": [1.0]}) == new | {"ratio": [9.0, *new["ratio"]]}
-    monkeypatch.setattr(gate_parts, "KEPT_ROUNDS", gate_parts.RECORDED_ROUNDS)
-    assert record_speed({"ratio": [9.0]}) == new
+def test_a_ratio_is_of_the_least_times_and_not_the_least_ratio(monkeypatch: pytest.MonkeyPatch) -> None:
+    sweeps = iter([Times(4.0, 2.0), Times(3.0, 6.0), Times(5.0, 4.0)])
+    monkeypatch.setattr("benchmarks.gate.speed.speed_times", lambda: {"ratio": next(sweeps)})
+    monkeypatch.setattr("benchmarks.gate.speed.th.set_num_threads", lambda number: None)
+    assert speed_ratios() == {"ratio": 1.5}
+    assert not list(sweeps)
+
+
+def test_recording_speed_keeps_the_last_recordings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate_parts, "speed_ratios", lambda: {"ratio": 0.5})
+    (first,) = record_speed(None)
+    assert first["ratios"] == {"ratio": [0.5] * gate_parts.RECORDED_RUNS}
+    assert first["date"] and first["processor"] and "commit" in first
+    former = [{"ratios": {"ratio": [float(number)]}} for number in range(gate_parts.KEPT_RECORDINGS)]
+    assert record_speed(former[:1]) == [former[0], first]
+    assert record_speed(former) == [*former[1:], first]
+
+
+def test_a_band_of_speed_is_about_what_is_usual_and_about_what_is_still_measured() -> None:
+    recorded = [{"ratios": {"ratio": [1.0, 9.0], "old": [1.0]}}, {"ratios": {"ratio": [2.0], "new": [4.0]}}]
+    assert speed_bands(recorded) == {"ratio": Band(0.0, 3.0), "new": Band(0.0, 6.0)}
 
 
 def test_arithmetic_of_products_and_calls_of_operators_are_counted() -> None:
@@ -63,20 +80,29 @@ def test_arithmetic_of_products_and_calls_of_operators_are_counted() -> None:
     assert counted(lambda: None) == (0, 0)
 
 
-def test_calls_of_functions_are_counted_and_the_former_profile_is_put_back() -> None:
+def test_calls_of_functions_are_counted_by_step_and_the_former_profile_is_put_back() -> None:
     former = sys.getprofile()
 
     def own() -> None:
         [len(()), abs(1)]
 
-    def fails() -> None:
+    steps = CallsByStep()
+    with steps:
+        for times in (5, 1, 2, 4):
+            for _ in range(times):
+                own()
+            steps._on_step()
+    counts = np.diff(steps.calls_at_steps)
+    assert list(np.diff(counts)) == [3 * 1, 3 * 2]
+    with pytest.raises(KeyError), CallsByStep():
         raise KeyError
-
-    assert calls(own) == 3
-    assert calls(lambda: [own(), own()]) == 7
-    with pytest.raises(KeyError):
-        calls(fails)
     assert sys.getprofile() is former
+
+
+def test_calls_are_counted_under_a_profiler() -> None:
+    with cProfile.Profile(), CallsByStep() as steps:
+        len(())
+    assert steps.calls > 0
 
 
 @pytest.mark.parametrize(
@@ -96,9 +122,21 @@ def test_a_plant_does_the_work_two_times_and_goes_away() -> None:
     calls = []
     assert twice(lambda number: calls.append(number) or number)(3) == 3
     assert calls == [3, 3]
+    places = [
+        (trust_region, "conjugate_gradient"),
+        (ActionSampler, "__call__"),
+        (GAERolloutBuffer, "compute_returns_and_advantage"),
+        *((TRPOGAE, name) for name in ("train", "_step_policy", "_fit_value")),
+    ]
+
+    def in_place() -> list[object]:
+        return [getattr(owner, name) for owner, name in places]
+
+    before = in_place()
     for plant in PLANTS.values():
-        with plant.fault() as patched:
-            assert patched is not None
+        with plant.fault():
+            assert in_place() != before
+        assert in_place() == before
 
 
 def test_a_fault_is_noticed_by_its_own_numbers_and_where_nothing_else_is_red(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,29 +158,6 @@ def test_a_fault_is_noticed_by_its_own_numbers_and_where_nothing_else_is_red(mon
     assert not prove_with(red, red)
 
 
-def test_a_time_counts_against_the_code_only_where_each_try_is_outside_its_band(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    band, measured = Band(0.0, 1.5), iter([])
-    limits = {"one": band, "other": band}
-    part = Part(lambda: next(measured), lambda before: before, lambda recorded: limits, "ratio", tries=3)
-    monkeypatch.setitem(PARTS, "part", part)
-
-    def measured_of(*rounds: tuple[float, float]) -> dict[str, float]:
-        nonlocal measured
-        measured = iter([{"one": one, "other": other} for one, other in rounds])
-        least = gate.measure("part", limits)
-        assert not list(measured), "fewer tries than are allowed"
-        return least
-
-    assert measured_of((1.0, 1.2)) == {"one": 1.0, "other": 1.2}
-    # What was good is not measured worse by a try for another number
-    assert measured_of((1.0, 2.0), (3.0, 1.4)) == {"one": 1.0, "other": 1.4}
-    assert "again (2 left): other" in capsys.readouterr().out
-    assert measured_of((1.0, 2.0), (1.0, 1.9), (1.0, 2.1)) == {"one": 1.0, "other": 1.9}
-    assert not gate.verdicts({"one": 1.0, "other": 1.9}, limits)["other"]
-
-
 def test_every_fault_has_numbers_that_are_recorded() -> None:
     records = read_records()
     for plant in PLANTS.values():
@@ -161,7 +176,8 @@ def test_the_records_cover_what_is_measured_with_seeds_of_their_own() -> None:
     for name, scores in (records["learning"] | records["work"]).items():
         assert len(scores) >= 20, name
         assert not {int(seed) for seed in scores} & {*SEEDS, SEED}, name
-    assert {f"rollout / steps, {task}" for task in ROLLOUT_TASKS} < set(records["speed"])
-    assert all(len(runs) >= 10 for runs in records["speed"].values())
+    for recording in records["speed"]:
+        assert {f"rollout / steps, {task}" for task in ROLLOUT_TASKS} < set(recording["ratios"])
+        assert all(len(runs) == gate_parts.RECORDED_RUNS for runs in recording["ratios"].values())
     for name, part in PARTS.items():
         assert all(band.low < band.high for band in part.bands(records[name]).values())

@@ -8,9 +8,9 @@ Turns red when speed or learning have got worse than what is recorded of unchang
     python -m benchmarks.gate repeat --times 20   # how often unchanged code is red
     python -m benchmarks.gate draw                # the history as a figure
 
-A mean of learning scores may be four standard errors off, a ratio of times half above the largest recorded in each of three
-measurements, and a count of work 5 % above the largest of other seeds. An improvement that leaves a band, or makes one wider
-than need be, is to be recorded anew, on purpose.
+A mean of learning scores may be four standard errors off, a ratio of times half above the median of what is recorded, and a
+count of work 5 % above the largest of other seeds. An improvement that leaves a band, or makes one wider than need be, is to
+be recorded anew, on purpose.
 """
 
 import argparse
@@ -44,7 +44,7 @@ def red_numbers(part: str, keep: bool = False, quiet: bool = False) -> set[str]:
     :return: names of the numbers that are outside their bands
     """
     limits = PARTS[part].bands(read_records()[part])
-    measured = measure(part, limits)
+    measured = PARTS[part].measure()
     holds = verdicts(measured, limits)
     for name, value in measured.items():
         if not (quiet and holds[name]):
@@ -52,23 +52,6 @@ def red_numbers(part: str, keep: bool = False, quiet: bool = False) -> set[str]:
     if keep:
         remember(part, measured, limits)
     return {name for name, good in holds.items() if not good}
-
-
-def measure(part: str, limits: dict[str, Band]) -> dict[str, float]:
-    """
-    :param part: of the gate
-    :param limits: by name
-    :return: by name; where a number was outside its band, the least of as many tries as its part allows
-    """
-    measured = PARTS[part].measure()
-    for left in range(PARTS[part].tries - 1, 0, -1):
-        red = [name for name, good in verdicts(measured, limits).items() if not good]
-        if not red:
-            break
-        print(f"again ({left} left): {', '.join(red)}", flush=True)
-        again = PARTS[part].measure()
-        measured |= {name: min(measured[name], again[name]) for name in red}
-    return measured
 
 
 def line(part: str, name: str, value: float, band: Band) -> str:
@@ -152,7 +135,7 @@ def main() -> int:
         return 0
     good = {
         "check": lambda: check(args.parts, args.keep),
-        "prove": lambda: prove(args.plants),
+        "prove": lambda: prove([name for name in args.plants if PLANTS[name].part in args.parts]),
         "repeat": lambda: repeat(args.parts, args.times),
     }[args.verb]()
     return 0 if good else 1

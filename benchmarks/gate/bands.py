@@ -8,11 +8,10 @@ import numpy as np
 
 #: deviations of the mean that are still taken for chance: once in about 16 000 where it is normally distributed
 LEARNING_DEVIATIONS = 4.0
-#: by how much a ratio of times may exceed the largest that was recorded. With unchanged code they differ by up to a fifth
-#: between kinds of processor, and by a quarter between days on one kind
+#: by how much a ratio of times may exceed the median of what is recorded: unchanged code differs by as much as a fifth between
+#: kinds of processor, and between days on one kind
 SPEED_MARGIN = 1.5
-#: by how much a count may exceed the largest of other seeds: a step of conjugate gradient more in one of the value steps,
-#: or a few more episodes that end
+#: by how much a count may exceed the largest of other seeds: a step of conjugate gradient more in one of the value steps
 WORK_MARGIN = 1.05
 
 

@@ -1,5 +1,6 @@
 """The parts of the gate: what each measures, what is recorded of it, and the bands that follow from that."""
 
+import datetime
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,13 +10,15 @@ from benchmarks.gate.bands import SPEED_MARGIN, WORK_MARGIN, Band, cost_band, le
 from benchmarks.gate.learning import RUNS, SEEDS, learning_scores
 from benchmarks.gate.speed import speed_ratios
 from benchmarks.gate.work import work_counts
+from benchmarks.peers.provenance import processor
+from sb3_gae.sweep.provenance import provenance
 
 #: of what is recorded by seed; the gate itself uses others
 RECORDED_SEEDS = range(100, 120)
-#: of what is recorded run by run
-RECORDED_ROUNDS = 10
-#: how many of these are kept. Ratios differ more between days than within one recording
-KEPT_ROUNDS = 30
+#: runs of a recording of speed
+RECORDED_RUNS = 5
+#: recordings of speed that are kept. Ratios differ more between days than within one recording
+KEPT_RECORDINGS = 6
 
 
 class Part(NamedTuple):
@@ -24,15 +27,12 @@ class Part(NamedTuple):
     :param record: what bands are made from, given what was recorded before (None if nothing was)
     :param bands: by name, of what is recorded
     :param unit: of the numbers
-    :param tries: how often a number may be measured that is outside its band. More than once where other programs can
-        spoil a measurement: they make a cost larger and never smaller, so the least counts
     """
 
     measure: Callable[[], dict[str, float]]
     record: Callable[[Any], Any]
     bands: Callable[[Any], dict[str, Band]]
     unit: str
-    tries: int = 1
 
 
 def record_work(_before: Any) -> dict[str, dict[str, float]]:
@@ -45,16 +45,24 @@ def work_bands(recorded: dict[str, dict[str, float]]) -> dict[str, Band]:
     return {name: cost_band(list(counts.values()), WORK_MARGIN) for name, counts in recorded.items()}
 
 
-def record_speed(before: dict[str, list[float]] | None) -> dict[str, list[float]]:
-    """:return: ratios by name and run, after the last ones of before"""
-    former = before or {}
-    runs = _by_name({run: speed_ratios() for run in range(RECORDED_ROUNDS)})
-    return {name: [*former.get(name, []), *ratios.values()][-KEPT_ROUNDS:] for name, ratios in runs.items()}
+def record_speed(before: list[dict[str, Any]] | None) -> list[dict[str, Any]]:
+    """:return: recordings, the last ones of before first: ratios by name and run, and when and on what they were taken"""
+    ratios = _by_name({run: speed_ratios() for run in range(RECORDED_RUNS)})
+    recording = {
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "commit": provenance()["commit"],
+        "processor": processor(),
+        "ratios": {name: list(runs.values()) for name, runs in ratios.items()},
+    }
+    return [*(before or []), recording][-KEPT_RECORDINGS:]
 
 
-def speed_bands(recorded: dict[str, list[float]]) -> dict[str, Band]:
-    """:return: by name"""
-    return {name: cost_band(ratios, SPEED_MARGIN) for name, ratios in recorded.items()}
+def speed_bands(recorded: list[dict[str, Any]]) -> dict[str, Band]:
+    """:return: by name, for what the last recording has"""
+    return {
+        name: cost_band([float(np.median([ratio for of in recorded for ratio in of["ratios"].get(name, [])]))], SPEED_MARGIN)
+        for name in recorded[-1]["ratios"]
+    }
 
 
 def measure_learning() -> dict[str, float]:
@@ -80,6 +88,6 @@ def _by_name(runs: dict[Any, dict[str, float]]) -> dict[str, dict[Any, float]]:
 #: by name, the quickest first
 PARTS = {
     "work": Part(work_counts, record_work, work_bands, "count"),
-    "speed": Part(speed_ratios, record_speed, speed_bands, "ratio of times", tries=3),
+    "speed": Part(speed_ratios, record_speed, speed_bands, "ratio of times"),
     "learning": Part(measure_learning, record_learning, learning_bands, "mean return"),
 }

@@ -2,10 +2,12 @@
 
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from benchmarks.update_speed import Update, ours, theirs
@@ -21,7 +23,19 @@ N_ENVS, N_STEPS = 64, 64
 ROLLOUT_TASKS = ("GaeBiped-v0", "GaeCartPole-v0")
 #: where a step costs what its Python does
 N_FEW_ENVS, N_CALLS = 8, 100
-ROUNDS = 9
+ROUNDS = 5
+#: over all that is timed, so that a slow while of the machine is not in all rounds of anything
+SWEEPS = 3
+
+
+class Times(NamedTuple):
+    """
+    :param of: seconds of what is judged
+    :param per: seconds of what it is compared with
+    """
+
+    of: float
+    per: float
 
 
 def speed_ratios() -> dict[str, float]:
@@ -29,17 +43,24 @@ def speed_ratios() -> dict[str, float]:
     :return: by name; the smaller the faster
     """
     th.set_num_threads(1)
+    sweeps = [speed_times() for _ in range(SWEEPS)]
+    # The least of each by itself: of ratios the least would be the one whose divisor was slowed down
+    return {name: min(times[name].of for times in sweeps) / min(times[name].per for times in sweeps) for name in sweeps[0]}
+
+
+def speed_times() -> dict[str, Times]:
+    """:return: by name"""
     return (
-        update_ratios()
-        | {"actions / policy's own": actions_ratio()}
-        | {f"rollout / steps, {task}": rollout_ratio(task) for task in ROLLOUT_TASKS}
+        update_times()
+        | {"actions / policy's own": actions_times()}
+        | {f"rollout / steps, {task}": rollout_times(task) for task in ROLLOUT_TASKS}
     )
 
 
-def update_ratios() -> dict[str, float]:
+def update_times() -> dict[str, Times]:
     """
-    :return: an update over that of sb3-contrib's TRPO on the same rollout; policy step and value fit over a forward and
-        backward pass of both networks; a grid of 16 advantages over one pass
+    :return: an update and that of sb3-contrib's TRPO on the same rollout; policy step and value fit and a forward and
+        backward pass of both networks; a grid of 16 advantages and one pass
     """
     model = ours(BATCH)
     update, peer = Update(model), Update(theirs(model))
@@ -58,17 +79,17 @@ def update_ratios() -> dict[str, float]:
         }
     )
     return {
-        "update / sb3-contrib's": times["update"] / times["peer"],
-        "policy step / passes": times["policy"] / times["passes"],
-        "value fit / passes": times["value"] / times["passes"],
-        "16 advantages / 1": times["grid"] / times["single"],
+        "update / sb3-contrib's": Times(times["update"], times["peer"]),
+        "policy step / passes": Times(times["policy"], times["passes"]),
+        "value fit / passes": Times(times["value"], times["passes"]),
+        "16 advantages / 1": Times(times["grid"], times["single"]),
     }
 
 
-def rollout_ratio(task: str) -> float:
+def rollout_times(task: str) -> Times:
     """
     :param task: id
-    :return: a rollout over stepping the same environments with given actions
+    :return: a rollout, and stepping the same environments with given actions
     """
     collect, env = rollout(task)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (N_STEPS, N_ENVS, *env.action_space.shape)).astype(np.float32)
@@ -78,25 +99,26 @@ def rollout_ratio(task: str) -> float:
             "steps": (lambda: [env.step(action) for action in actions], None),
         }
     )
-    return times["rollout"] / times["steps"]
+    return Times(times["rollout"], times["steps"])
 
 
-def rollout(task: str, seed: int = 0) -> tuple[Callable[[], bool], VecEnv]:
+def rollout(task: str, seed: int = 0, callback: MaybeCallback = None) -> tuple[Callable[[], bool], VecEnv]:
     """
     :param task: id
     :param seed: of environments and policy
+    :param callback: called at each step
     :return: collects a batch of a new agent, and the environments that it steps
     """
     env = make_vec_env(task, N_ENVS, seed=seed, vec_env_cls=batched_vec_env, vec_env_kwargs={"n_threads": 1})
     model = TRPOGAE("MlpPolicy", env, n_steps=N_STEPS, seed=seed, device="cpu")
-    _, callback = model._setup_learn(N_ENVS * N_STEPS)
-    callback.on_training_start(locals(), globals())
-    return lambda: model.collect_rollouts(model.env, callback, model.rollout_buffer, N_STEPS), env
+    _, callbacks = model._setup_learn(N_ENVS * N_STEPS, callback)
+    callbacks.on_training_start(locals(), globals())
+    return lambda: model.collect_rollouts(model.env, callbacks, model.rollout_buffer, N_STEPS), env
 
 
-def actions_ratio() -> float:
+def actions_times() -> Times:
     """
-    :return: the actions of a few environments in each of a hundred steps over those of the policy's own method
+    :return: the actions of a few environments in each of a hundred steps, and those of the policy's own method
     """
     policy = ours(BATCH).policy
     observations = np.random.default_rng(0).standard_normal((N_FEW_ENVS, *policy.observation_space.shape)).astype(np.float32)
@@ -113,7 +135,7 @@ def actions_ratio() -> float:
             "policy": (ask_policy, None),
         }
     )
-    return times["actions"] / times["policy"]
+    return Times(times["actions"], times["policy"])
 
 
 def forward_and_backward(model: TRPOGAE) -> None:

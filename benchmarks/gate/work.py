@@ -3,13 +3,15 @@
 import sys
 from collections.abc import Callable
 from types import FrameType
-from typing import Any
+from typing import Any, Self
 
+import numpy as np
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from benchmarks.gate.speed import BATCH, N_STEPS, ROLLOUT_TASKS, forward_and_backward, rollout
+from benchmarks.gate.speed import BATCH, ROLLOUT_TASKS, forward_and_backward, rollout
 from benchmarks.update_speed import ours
 from sb3_gae.rollout.evaluation import training_batch
 
@@ -23,7 +25,7 @@ UPDATE_COUNTS = (
     "arithmetic of value fit / passes",
     "operators of value fit",
 )
-#: functions that a step of all environments calls, Python's and C's. What the environments do in them is not in it
+#: functions that most steps of all environments call, Python's and C's; what ends an episode calls more
 ROLLOUT_COUNTS = tuple(f"calls of a rollout's step, {task}" for task in ROLLOUT_TASKS)
 COUNTS = (*UPDATE_COUNTS, *ROLLOUT_COUNTS)
 
@@ -51,7 +53,7 @@ def work_counts(seed: int = SEED) -> dict[str, float]:
     """
     th.set_num_threads(1)
     return update_counts(seed) | {
-        name: calls(rollout(task, seed)[0]) / N_STEPS for name, task in zip(ROLLOUT_COUNTS, ROLLOUT_TASKS, strict=True)
+        name: calls_of_a_step(task, seed) for name, task in zip(ROLLOUT_COUNTS, ROLLOUT_TASKS, strict=True)
     }
 
 
@@ -80,22 +82,39 @@ def counted(action: Callable[[], object]) -> tuple[int, int]:
     return arithmetic.get_total_flops(), operators.calls
 
 
-def calls(action: Callable[[], object]) -> int:
-    """
-    :param action: to be done once
-    :return: functions of Python and of C that are called for it, itself among them
-    """
-    count = 0
+class CallsByStep(BaseCallback):
+    """Counts the functions, of Python and of C, that are called by each step within the ``with`` statement."""
 
-    def see(_frame: FrameType, event: str, _arg: Any) -> None:
-        nonlocal count
-        count += event in ("call", "c_call")
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls = 0
+        self.calls_at_steps: list[int] = []
 
-    before = sys.getprofile()
-    sys.setprofile(see)
-    try:
-        action()
-    finally:
-        sys.setprofile(before)
-    # Putting the former profile back is one
-    return count - 1
+    def _see(self, _frame: FrameType, event: str, _arg: Any) -> None:
+        self.calls += event in ("call", "c_call")
+
+    def _on_step(self) -> bool:
+        self.calls_at_steps.append(self.calls)
+        return True
+
+    def __enter__(self) -> Self:
+        self._before = sys.getprofile()
+        sys.setprofile(self._see)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # What cProfile says it was is no function on Python 3.11
+        sys.setprofile(self._before if callable(self._before) else None)
+
+
+def calls_of_a_step(task: str, seed: int) -> float:
+    """
+    :param task: id
+    :param seed: of environments and policy
+    :return: median over the steps of a rollout, so that neither the episodes that happen to end nor what is done once counts
+    """
+    steps = CallsByStep()
+    collect, _ = rollout(task, seed, steps)
+    with steps:
+        collect()
+    return float(np.median(np.diff(steps.calls_at_steps)))
