@@ -6,7 +6,8 @@
 #   make format                    put formatting right
 #   make docs                      build the book into docs/_build/html; a warning is an error
 #   make bench                     the gate: has anything become slower, or does it learn less? Five minutes
-#   make bench-full                also speed of whole iterations and of each part, what the shipped settings reach, and peers (days)
+#   make bench-full                also speed of whole iterations and of each part; and what is not in benchmarks/results yet of
+#                                  what the shipped settings reach and of the runs beside peers (days, if nothing is)
 #   make clean                     remove .venv and what builds and tools left
 #   make PYTHON=python3.12 train   choose an interpreter
 

@@ -14,6 +14,7 @@ from benchmarks.peers.journal import Record
 from benchmarks.peers.plan import PRESETS, Cell, cells_of
 from benchmarks.peers.protocol import CLASSIC_TASKS, EVALUATIONS, MUJOCO_TASKS, evaluation_interval
 from benchmarks.peers.settings import described, settings_for, settings_of, zoo_file
+from benchmarks.peers.table import read_results
 from benchmarks.peers.variants import VARIANTS
 from sb3_gae import TRPOGAE
 from sb3_gae.zoo import default_hyperparams_path
@@ -98,6 +99,16 @@ def test_variants_are_arguments_that_the_algorithm_takes(name: str) -> None:
     model = TRPOGAE("MlpPolicy", "Pendulum-v1", **arguments)
     assert all(getattr(model, key) == value for key, value in arguments.items())
     assert (model.gae_lambda == 0.95) == ("gae_lambda" not in arguments)
+
+
+def test_what_was_tried_in_tuning_is_what_its_settings_say_today() -> None:
+    """Else what is shipped later would change what a row of the table means, and new seeds would join old ones."""
+    table = read_results()
+    tried = table[(table["algorithm"] == OURS) & ~table["variant"].isin(VARIANTS)]
+    assert len(tried)
+    for (task, variant, steps, settings), _ in tried.groupby(["task", "variant", "steps", "settings"]):
+        today = described(OURS, settings_of(Cell(task, OURS, variant, 0, int(steps))))
+        assert json.loads(today) == json.loads(described(OURS, json.loads(settings))), (task, variant)
 
 
 def test_there_are_as_many_evaluations_as_said() -> None:

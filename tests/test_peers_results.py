@@ -225,6 +225,28 @@ def test_a_target_is_met_once_all_that_it_is_about_has_been_run() -> None:
     assert first(whole.assign(former=whole["task"] == "Ant-v5")) == ["6 of 6", "3", "so far yes"]
 
 
+def test_a_target_that_is_met_by_what_trpo_does_not_learn_alone_says_so() -> None:
+    def end(task: str, name: str) -> float:
+        if name == TRPO:
+            return 100.0 if task == "Ant-v5" else 1000.0
+        return 1700.0 if task in ("HalfCheetah-v5", "Hopper-v5") else 1000.0
+
+    whole = pd.concat(
+        [
+            a_run(task, name, seed, MUJOCO_STEPS, end=end(task, name))
+            for task in MUJOCO_TASKS
+            for name in (OURS, TRPO)
+            for seed in range(SEEDS)
+        ],
+        ignore_index=True,
+    )
+    begins = (whole["task"] == "Ant-v5") & (whole["step"] == 0)
+    whole.loc[begins, "mean_return"] = 900.0
+    assert rows_of(targets.targets_table(whole))[0][-1] == "so far only with Ant-v5"
+    elsewhere = whole["task"] != "Ant-v5"
+    assert rows_of(targets.targets_table(whole[elsewhere]))[0][-1] == "so far **no**"
+
+
 def test_what_trpo_does_not_learn_is_no_target() -> None:
     table = TABLE.copy()
     falls = (table["task"] == "Hopper-v5") & (table["algorithm"] == TRPO)
@@ -280,6 +302,9 @@ def test_the_page_keeps_what_is_not_between_markers() -> None:
     assert filled(new, {"one": ""}).startswith("a\n<!-- results: one -->\n<!-- end -->\nb")
     with pytest.raises(PeersError, match="`page` must have the markers of 'three' once"):
         filled(page, {"three": ""})
+    # Else all up to the end of the next section would go
+    with pytest.raises(PeersError, match="markers of 'one' once"):
+        filled(page.replace("<!-- end -->", "", 1), {"one": ""})
 
 
 def test_export_keeps_runs_that_are_not_here(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ def filled(page: str, sections: Mapping[str, str]) -> str:
     :raises PeersError: if a marker is missing
     """
     for name, content in sections.items():
-        between = re.compile(rf"(<!-- results: {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
+        between = re.compile(rf"(<!-- results: {re.escape(name)} -->\n)(?:(?!<!-- results: ).)*?(<!-- end -->)", re.DOTALL)
         if len(between.findall(page)) != 1:
             raise PeersError(f"`page` must have the markers of {name!r} once: <!-- results: {name} --> and <!-- end -->.")
         body = f"\n{content}\n\n" if content else ""
