@@ -188,6 +188,12 @@ PENDULUM_CANDIDATES = {
             _SDE_1024 | {"cg_damping": 0.01},
         ),
         ("sde-two-envs-1024-gamma-.95", "gSDE, 2 × 512 steps, γ 0.95", _SDE_1024 | {"gamma": 0.95}),
+        ("sde-two-envs-1024-gamma-.97", "gSDE, 2 × 512 steps, γ 0.97", _SDE_1024 | {"gamma": 0.97}),
+        (
+            "sde-two-envs-1024-gamma-.95-noise-8",
+            "gSDE, a new noise matrix every eight steps, 2 × 512 steps, γ 0.95",
+            _SDE_1024 | {"gamma": 0.95, "sde_sample_freq": 8},
+        ),
         ("sde-two-envs-1024-vf-steps-10", "gSDE, 2 × 512 steps, up to ten value steps", _SDE_1024 | {"vf_steps": 10}),
         (
             "sde-two-envs-1024-normalized",
