@@ -332,11 +332,6 @@ HUMANOID_CANDIDATES = {
         ),
         ("lambda-.95", "λ 0.95, KL 0.03, dampings 30 and 3", _HUMANOID_DAMPED | {"gae_lambda": 0.95}),
         ("lambda-.98", "λ 0.98, KL 0.03, dampings 30 and 3", _HUMANOID_DAMPED | {"gae_lambda": 0.98}),
-        (
-            "wide",
-            "two layers of 256 units, KL 0.03, dampings 30 and 3",
-            _HUMANOID_DAMPED | {"policy_kwargs": "dict(log_std_init=-2, net_arch=[256, 256])"},
-        ),
     )
 }
 
