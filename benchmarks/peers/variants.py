@@ -149,6 +149,7 @@ _PENDULUM = {
     "gae_lambda": 0.95,
     "target_kl": 0.01,
     "use_sde": False,
+    "sde_sample_freq": 4,
     "cg_damping": 0.1,
     "vf_cg_damping": "auto",
 }
